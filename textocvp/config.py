@@ -1,0 +1,199 @@
+"""Every choice of architecture, as dataclasses, and the named presets that put them together.
+
+A checkpoint stores one `ModelConfig` as JSON; `ModelConfig.from_dict` reads it back and names any field it does not
+know. Sizes of the published model are from TextOCVP (TMLR 2026), section 4 and appendix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+from textocvp.slots import SlotLayout
+
+
+@dataclass(frozen=True)
+class ParserConfig:
+    """From a frame to slots: encoder -> initializer -> corrector -> transition.
+
+    Attributes:
+        image_size: side of the square frame in pixels.
+        num_slots: K, background included. Can be raised when the model is used.
+        layout: what the numbers of a slot mean.
+        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from colour clusters.
+        encoder_channels: width of the convolutional encoder.
+        encoder_stride: stride of its first convolution.
+        iterations_first, iterations_next: corrector iterations on the first and on later frames.
+        corrector: `slot_attention` (published) or `placed` (invariant slot attention with explicit colour, place
+            and size; needs `layout.explicit`).
+        transition_heads, transition_hidden: the transformer block between frames.
+    """
+
+    image_size: int = 64
+    num_slots: int = 12
+    layout: SlotLayout = SlotLayout(content=64)
+    initializer: Literal["gaussian", "cluster"] = "cluster"
+    encoder_channels: int = 32
+    encoder_stride: int = 1
+    iterations_first: int = 1
+    iterations_next: int = 1
+    corrector: Literal["slot_attention", "placed"] = "placed"
+    transition_heads: int = 4
+    transition_hidden: int = 128
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """From slots to frames and masks.
+
+    Attributes:
+        kind: `broadcast` (spatial broadcast decoder, published) or `glimpse` (a small canonical picture a slot,
+            placed at the slot's position and scale over a background canvas; needs `layout.explicit`).
+        channels: width of the decoder's convolutions.
+        glimpse_size: side of the canonical picture in pixels (`glimpse` only).
+        glimpse_extent: how many standard deviations the glimpse reaches to each side (`glimpse` only).
+    """
+
+    kind: Literal["broadcast", "glimpse"] = "glimpse"
+    channels: int = 32
+    glimpse_size: int = 16
+    glimpse_extent: float = 3.0
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """From a sentence to tokens.
+
+    Attributes:
+        kind: `transformer` (small, from scratch) or `lexicon` (the same, and every token also carries the RGB of the
+            colour that it names, from a public colour lexicon).
+        dim: width of the token embeddings handed to the predictor.
+        layers, heads, hidden: the transformer.
+        max_tokens: longest sentence in words; a longer one is an error.
+    """
+
+    kind: Literal["transformer", "lexicon"] = "lexicon"
+    dim: int = 128
+    layers: int = 2
+    heads: int = 4
+    hidden: int = 256
+    max_tokens: int = 64
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """From slots and text to the slots of the next frame.
+
+    Attributes:
+        dim: token width. layers, heads, hidden: the transformer (`hidden` of every feed-forward net).
+        attention: `window` (published: bidirectional over the last `window` frames, recomputed each step) or
+            `causal` (each frame sees itself and its past; keys and values are cached).
+        window: the longest past, in frames. For `causal` also the longest rollout it can be trained or used for.
+        age_encoding: `learned` (published) or `sinusoidal`, one code per frame, the same for all its slots.
+        residual: predict the change of the slots instead of the slots (published).
+        color_bias: add the colour-matching term to the text-to-slot attention (needs the lexicon encoder and explicit
+            slot colours).
+        feed_forwards: feed-forward nets a layer: 2 as the authors' code, 1 as the text.
+    """
+
+    dim: int = 512
+    layers: int = 8
+    heads: int = 8
+    hidden: int = 1024
+    attention: Literal["window", "causal"] = "window"
+    window: int = 10
+    age_encoding: Literal["learned", "sinusoidal"] = "learned"
+    residual: bool = True
+    color_bias: bool = False
+    feed_forwards: Literal[1, 2] = 2
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """A whole TextOCVP.
+
+    Attributes:
+        name: the preset it came from.
+        parser, renderer, text, predictor: its four parts.
+    """
+
+    name: str
+    parser: ParserConfig = field(default_factory=ParserConfig)
+    renderer: RendererConfig = field(default_factory=RendererConfig)
+    text: TextConfig = field(default_factory=TextConfig)
+    predictor: PredictorConfig = field(default_factory=PredictorConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionaries, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> ModelConfig:
+        """The inverse of `to_dict`.
+
+        Raises:
+            ValueError: if a field is unknown; the message gives its full name and the fields that exist.
+        """
+        return _build(cls, data, "config")
+
+
+_NESTED = {
+    "parser": ParserConfig,
+    "renderer": RendererConfig,
+    "text": TextConfig,
+    "predictor": PredictorConfig,
+    "layout": SlotLayout,
+}
+
+
+def _build(cls: type, data: Mapping[str, Any], path: str) -> Any:
+    names = [f.name for f in fields(cls)]
+    unknown = sorted(set(data) - set(names))
+    if unknown:
+        raise ValueError(f"{path}: unknown field {unknown[0]!r}; known: {', '.join(names)}")
+    values = {
+        key: _build(_NESTED[key], value, f"{path}.{key}") if key in _NESTED and isinstance(value, Mapping) else value
+        for key, value in data.items()
+    }
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+PRESETS: dict[str, ModelConfig] = {
+    # The one that ships: small enough to train on two CPU cores in hours.
+    "tabletop-small": ModelConfig(
+        name="tabletop-small",
+        predictor=PredictorConfig(
+            dim=192, layers=4, heads=8, hidden=384, attention="causal", window=40, color_bias=True, feed_forwards=1
+        ),
+    ),
+    # The paper's TextOCVP-SAVi at its own sizes (CATER, 64x64).
+    "savi-cater": ModelConfig(
+        name="savi-cater",
+        parser=ParserConfig(
+            num_slots=8,
+            layout=SlotLayout(content=128, explicit=False),
+            initializer="gaussian",
+            iterations_first=3,
+            corrector="slot_attention",
+            transition_hidden=512,
+        ),
+        renderer=RendererConfig(kind="broadcast"),
+        text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
+    ),
+}
+
+
+def preset(name: str) -> ModelConfig:
+    """The preset of that name.
+
+    Raises:
+        KeyError: if there is none; the message lists those that exist.
+    """
+    try:
+        return PRESETS[name]
+    except KeyError:
+        raise KeyError(f"unknown preset {name!r}; known: {', '.join(sorted(PRESETS))}") from None

@@ -1,0 +1,69 @@
+"""What the numbers of a slot mean.
+
+Everywhere between the rooms a set of slots is one tensor `slots_BKD` (or `slots_BTKD` for a sequence). In the
+published model all D numbers are one unexplained vector. Our shipped model also gives a slot an explicit colour,
+place, size and presence, so that the same tensor can be rolled out by the predictor, drawn by the renderer and
+read by a planner. `SlotLayout` says which of the D numbers are which; nothing else in the code base knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SlotLayout:
+    """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`.
+
+    Attributes:
+        content: number of learned, unexplained channels.
+        explicit: whether the 8 explicit channels follow the content. Without them (the published form) D = content.
+    """
+
+    content: int
+    explicit: bool = True
+
+    @property
+    def dim(self) -> int:
+        """D, the width of one slot."""
+        return self.content + (8 if self.explicit else 0)
+
+
+@dataclass
+class SlotState:
+    """A slot tensor taken apart. Leading axes `...` are any of (B, K), (B, T, K).
+
+    Attributes:
+        content: (..., C) learned channels.
+        color: (..., 3) mean RGB of the slot's pixels, -1..1 as in the model's frames.
+        position: (..., 2) centre of mass (x, y), -1..1 from left to right and top to bottom.
+        scale: (..., 2) standard deviation of the slot's pixels along x and y, same unit as position, positive.
+        presence: (..., 1) 1 for a slot that holds something, 0 for an unused one.
+    """
+
+    content: Tensor
+    color: Tensor
+    position: Tensor
+    scale: Tensor
+    presence: Tensor
+
+    def join(self) -> Tensor:
+        """The slot tensor (..., C + 8)."""
+        return torch.cat([self.content, self.color, self.position, self.scale, self.presence], dim=-1)
+
+    @classmethod
+    def split(cls, slots: Tensor, layout: SlotLayout) -> SlotState:
+        """Take a slot tensor (..., D) apart.
+
+        Raises:
+            ValueError: if the layout has no explicit channels, or its width is not D.
+        """
+        if not layout.explicit:
+            raise ValueError("these slots have no explicit colour, position or scale (layout.explicit is False)")
+        if slots.shape[-1] != layout.dim:
+            raise ValueError(f"slots are {slots.shape[-1]} wide, the layout says {layout.dim}")
+        content, color, position, scale, presence = slots.split([layout.content, 3, 2, 2, 1], dim=-1)
+        return cls(content, color, position, scale, presence)
