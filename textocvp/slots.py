@@ -67,3 +67,18 @@ class SlotState:
             raise ValueError(f"slots are {slots.shape[-1]} wide, the layout says {layout.dim}")
         content, color, position, scale, presence = slots.split([layout.content, 3, 2, 2, 1], dim=-1)
         return cls(content, color, position, scale, presence)
+
+
+def pixel_grid(height: int, width: int, *, device: torch.device | str | None = None) -> Tensor:
+    """Where the pixel centres lie in the unit of `SlotState.position`.
+
+    The picture's edges are at -1 and 1, so the first of W pixel centres is at 1/W - 1; a position p is at
+    `(p + 1) / 2 * W` pixels, where the first centre is 0.5.
+
+    Returns:
+        (height, width, 2) of (x, y), float32.
+    """
+    y = (torch.arange(height, device=device, dtype=torch.float32) + 0.5) * (2 / height) - 1
+    x = (torch.arange(width, device=device, dtype=torch.float32) + 0.5) * (2 / width) - 1
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([grid_x, grid_y], dim=-1)

@@ -1,0 +1,74 @@
+"""From frames to slots: the interface that every scene parser has, and the one place that picks one.
+
+A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition (between
+frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the subclass's business.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from textocvp.config import ParserConfig
+from textocvp.slots import SlotLayout
+
+
+@dataclass
+class Parsed:
+    """What a parser found.
+
+    Attributes:
+        slots_BTKD: the corrected slots of every frame.
+        attention_BTKhw: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
+    """
+
+    slots_BTKD: Tensor
+    attention_BTKhw: Tensor
+
+
+class SceneParser(nn.Module):
+    """Frames to slots. Subclasses set `layout` and write `forward`.
+
+    Attributes:
+        layout: what the numbers of one slot mean.
+    """
+
+    layout: SlotLayout
+
+    @abstractmethod
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Parsed:
+        """Parse clips.
+
+        Args:
+            frames_BT3HW: frames in -1..1, of the size the parser was built for.
+            num_slots: how many slots to use, background included; the configured number by default.
+            generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by default.
+        """
+        raise NotImplementedError
+
+
+def build_parser(config: ParserConfig) -> SceneParser:
+    """The parser that `config.corrector` names.
+
+    Raises:
+        ValueError: if there is no such corrector, or it does not fit the layout.
+    """
+    # Imported here because the parsers import this module for their base class.
+    if config.corrector == "slot_attention":
+        from textocvp.savi import SaviParser
+
+        return SaviParser(config)
+    if config.corrector == "placed":
+        from textocvp.placed import PlacedParser
+
+        return PlacedParser(config)
+    raise ValueError(f"unknown parser.corrector {config.corrector!r}; known: slot_attention, placed")

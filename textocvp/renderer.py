@@ -1,0 +1,62 @@
+"""From slots to frames and masks: the interface that every renderer has, and the one place that picks one."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from textocvp.config import RendererConfig
+from textocvp.slots import SlotLayout
+
+
+@dataclass
+class Rendered:
+    """What slots look like.
+
+    Attributes:
+        frames_B3HW: the composed frame, -1..1 (a renderer may overshoot slightly; `Rollout` clamps).
+        masks_BKHW: each slot's share of each pixel; sums to 1 over the slots.
+        object_frames_BK3HW: each slot drawn alone; the frame is their mask-weighted sum.
+    """
+
+    frames_B3HW: Tensor
+    masks_BKHW: Tensor
+    object_frames_BK3HW: Tensor
+
+
+class Renderer(nn.Module):
+    """Slots to pixels. Subclasses write `forward` and, where colours cost much, a cheaper `masks`."""
+
+    @abstractmethod
+    def forward(self, slots_BKD: Tensor) -> Rendered:
+        """Draw one frame for each set of slots."""
+        raise NotImplementedError
+
+    def masks(self, slots_BKD: Tensor) -> Tensor:
+        """Only the masks (B, K, H, W), for callers that look at no colours: a planner scores masks."""
+        return self(slots_BKD).masks_BKHW
+
+
+def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
+    """The renderer that `config.kind` names.
+
+    Args:
+        config: its kind and sizes.
+        layout: what the numbers of one slot mean.
+        image_size: side of the square frames it draws, in pixels.
+
+    Raises:
+        ValueError: if there is no such kind, or it does not fit the layout.
+    """
+    # Imported here because the renderers import this module for their base class.
+    if config.kind == "broadcast":
+        from textocvp.broadcast import BroadcastRenderer
+
+        return BroadcastRenderer(config, layout, image_size)
+    if config.kind == "glimpse":
+        from textocvp.glimpse import GlimpseRenderer
+
+        return GlimpseRenderer(config, layout, image_size)
+    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse")
