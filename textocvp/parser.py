@@ -22,11 +22,11 @@ class Parsed:
 
     Attributes:
         slots_BTKD: the corrected slots of every frame.
-        attention_BTKhw: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
+        attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
     """
 
     slots_BTKD: Tensor
-    attention_BTKhw: Tensor
+    attention_BTKHW: Tensor
 
 
 class SceneParser(nn.Module):

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from textocvp.config import RendererConfig
-from textocvp.slots import SlotLayout
+from textocvp.config import ParserConfig, RendererConfig
 
 
 @dataclass
@@ -39,24 +38,19 @@ class Renderer(nn.Module):
         return self(slots_BKD).masks_BKHW
 
 
-def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
-    """The renderer that `config.kind` names.
-
-    Args:
-        config: its kind and sizes.
-        layout: what the numbers of one slot mean.
-        image_size: side of the square frames it draws, in pixels.
+def build_renderer(parser: ParserConfig, config: RendererConfig) -> Renderer:
+    """The renderer that `config.kind` names, for the slots that the parser of `parser` makes.
 
     Raises:
-        ValueError: if there is no such kind, or it does not fit the layout.
+        ValueError: if there is no such kind, or it does not fit the parser's slot layout.
     """
     # Imported here because the renderers import this module for their base class.
     if config.kind == "broadcast":
         from textocvp.broadcast import BroadcastRenderer
 
-        return BroadcastRenderer(config, layout, image_size)
+        return BroadcastRenderer(parser, config)
     if config.kind == "glimpse":
         from textocvp.glimpse import GlimpseRenderer
 
-        return GlimpseRenderer(config, layout, image_size)
+        return GlimpseRenderer(parser, config)
     raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse")

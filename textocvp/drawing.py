@@ -1,0 +1,168 @@
+"""Pictures of rollouts: frames above masks, one stable colour a slot, enlarged so that a person can see something."""
+
+from __future__ import annotations
+
+import colorsys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+#: A picture in a film is enlarged to about this many pixels a side, one in a strip to about half of it.
+READABLE = 256
+#: A strip shows at most this many moments, and a film at most this many sequences side by side.
+STRIP_MOMENTS, FILM_COLUMNS = 12, 6
+GAP = 4
+PAPER, INK = (250, 250, 250), (30, 30, 30)
+
+
+def slot_palette(num_slots: int) -> np.ndarray:
+    """(num_slots, 3) RGB 0..1: slot k has the same colour in every picture, whatever the number of slots."""
+    # Steps of the golden ratio around the hue circle keep neighbours apart for any number of slots.
+    hues = (0.02 + 0.618034 * np.arange(num_slots)) % 1.0
+    values = np.where(np.arange(num_slots) % 2 == 0, 0.95, 0.7)
+    palette = np.array([colorsys.hsv_to_rgb(h, 0.75, v) for h, v in zip(hues, values, strict=True)])
+    palette[0] = 0.22  # slot 0 is the background in the shipped model: dark grey lets the objects stand out
+    return palette
+
+
+def color_masks(masks: np.ndarray) -> np.ndarray:
+    """Masks (..., K, H, W) as pictures (..., H, W, 3) uint8: each pixel the mask-weighted mix of the slots' colours."""
+    mixed = np.einsum("...khw,kc->...hwc", masks, slot_palette(masks.shape[-3]))
+    return (mixed.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def enlarge(picture: np.ndarray, factor: int) -> np.ndarray:
+    """(H, W, 3) to (H * factor, W * factor, 3) without smoothing: a pixel stays a square."""
+    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def save_film(
+    path: Path,
+    frames: np.ndarray,
+    masks: np.ndarray,
+    texts: Sequence[str],
+    *,
+    beside: np.ndarray | None = None,
+    fps: int = 6,
+) -> Path:
+    """Write sequences as a film (`.gif`, `.mp4`) or a strip (`.png`).
+
+    Args:
+        path: where to; missing folders are made.
+        frames: (B, T, 3, H, W) RGB 0..1.
+        masks: (B, T, K, H, W).
+        texts: B captions, or none.
+        beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, drawn above the imagined ones.
+        fps: frames a second.
+
+    Raises:
+        ValueError: if the suffix is another one, or `beside` has another shape.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".gif", ".mp4", ".png"):
+        raise ValueError(f"cannot write {path.name!r}: the name must end in .gif, .mp4 or .png")
+    B, T, _, H, W = frames.shape
+    imagined = (frames.transpose(0, 1, 3, 4, 2) * 255).round().astype(np.uint8)
+    rows = [imagined, color_masks(masks)]
+    if beside is not None:
+        rows.insert(0, _real_frames(beside, B, T, H, W))
+    stacked = np.stack(rows, axis=2)  # (B, T, rows, H, W, 3)
+    captions = list(texts) if texts else [""] * B
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    if suffix == ".png":
+        Image.fromarray(_strip(stacked, captions)).save(path)
+        return path
+    film = [_screen(stacked[:, t], captions) for t in range(T)]
+    if suffix == ".gif":
+        imageio.mimsave(path, film, format="GIF", duration=1000 / fps, loop=0)  # type: ignore[arg-type]
+    else:
+        # The video codec halves the colour planes, so both sides must be even.
+        even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in film]
+        imageio.mimsave(path, even, format="FFMPEG", fps=fps, macro_block_size=1)  # type: ignore[arg-type]
+    return path
+
+
+def _real_frames(beside: np.ndarray, B: int, T: int, H: int, W: int) -> np.ndarray:
+    real = np.asarray(beside)
+    if real.ndim == 4:
+        real = np.broadcast_to(real, (B, *real.shape))
+    if real.ndim != 5 or real.shape[0] != B or real.shape[2:] != (H, W, 3) or real.dtype != np.uint8:
+        raise ValueError(
+            f"beside must be uint8 frames (T', {H}, {W}, 3) or ({B}, T', {H}, {W}, 3), "
+            f"not {np.asarray(beside).dtype} {np.asarray(beside).shape}"
+        )
+    return real[:, np.minimum(np.arange(T), real.shape[1] - 1)]
+
+
+def _screen(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
+    """One moment: a column (real,) frame, masks for each sequence, at most `FILM_COLUMNS` side by side.
+
+    Args:
+        pictures: (B, rows, H, W, 3) uint8.
+        captions: B texts.
+    """
+    factor = max(1, READABLE // pictures.shape[2] // (2 if len(captions) > 1 else 1))
+    columns = [
+        _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in sequence], axis=0), caption)
+        for sequence, caption in zip(pictures, captions, strict=True)
+    ]
+    lines = [columns[i : i + FILM_COLUMNS] for i in range(0, len(columns), FILM_COLUMNS)]
+    return _stack([_beside(line) for line in lines])
+
+
+def _strip(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
+    """All moments from left to right, sequences under each other. `pictures` (B, T, rows, H, W, 3) uint8."""
+    T = pictures.shape[1]
+    moments = np.unique(np.linspace(0, T - 1, min(T, STRIP_MOMENTS)).round().astype(int))
+    factor = max(1, READABLE // 2 // pictures.shape[3])
+    bands = []
+    for sequence, caption in zip(pictures, captions, strict=True):
+        columns = [
+            _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in sequence[t]], axis=0), f"t = {t}")
+            for t in moments
+        ]
+        bands.append(_captioned(_beside(columns), caption))
+    return _stack(bands)
+
+
+def _framed(picture: np.ndarray) -> np.ndarray:
+    return np.pad(picture, ((0, GAP), (0, GAP), (0, 0)), constant_values=PAPER[0])
+
+
+def _beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    height = max(p.shape[0] for p in pictures)
+    return np.concatenate([_fill(p, height, p.shape[1]) for p in pictures], axis=1)
+
+
+def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    width = max(p.shape[1] for p in pictures)
+    return np.concatenate([_fill(p, p.shape[0], width) for p in pictures], axis=0)
+
+
+def _fill(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    return np.pad(
+        picture,
+        ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0)),
+        constant_values=PAPER[0],
+    )
+
+
+def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+    """The picture with its text on a band of paper below; without a text, the picture as it is."""
+    if not text:
+        return picture
+    font = ImageFont.load_default()
+    left, top, right, bottom = font.getbbox("x" * 40)
+    letters = max(1, int(picture.shape[1] / ((right - left) / 40)) - 1)
+    lines = textwrap.wrap(text, letters)
+    line_height = int(bottom - top) + 6
+    band = Image.new("RGB", (picture.shape[1], line_height * len(lines) + 4), PAPER)
+    pen = ImageDraw.Draw(band)
+    for number, line in enumerate(lines):
+        pen.text((2, 1 + number * line_height), line, fill=INK, font=font)
+    return np.concatenate([picture, np.asarray(band)], axis=0)

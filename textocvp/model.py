@@ -1,0 +1,183 @@
+"""TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
+
+A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the model, and no
+other). Loading is strict: a checkpoint that does not fit is an error that names the field or the tensor. Nothing is
+ever unpickled.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from huggingface_hub import PyTorchModelHubMixin, snapshot_download
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from textocvp.config import ModelConfig
+from textocvp.parser import build_parser
+from textocvp.renderer import build_renderer
+
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint is missing, damaged, or made for another model; the message says which part and why."""
+
+
+class TextOCVP(
+    nn.Module,
+    PyTorchModelHubMixin,
+    library_name="textocvp",
+    tags=["world-model", "object-centric", "video-prediction"],
+):
+    """The text-conditioned object-centric video predictor (TextOCVP, TMLR 2026, figure 1).
+
+    Attributes:
+        config: every choice of architecture.
+        parser: frames to slots.
+        text: sentences to tokens.
+        predictor: slots and tokens to the slots of the next frames.
+        renderer: slots to frames and masks.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        # Imported here until both files exist.
+        from textocvp.predictor import Predictor
+        from textocvp.text import TextEncoder
+
+        self.config = config
+        self.parser = build_parser(config.parser)
+        self.text = TextEncoder(config.text)
+        self.predictor = Predictor(config.predictor, config.parser.layout, config.text.dim)
+        self.renderer = build_renderer(config.parser, config.renderer)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model's parameters are."""
+        return next(self.parameters()).device
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Called by `save_pretrained(folder)`, which also writes a model card unless the folder has one."""
+        # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
+        tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in self.state_dict().items()}
+        save_file(tensors, save_directory / WEIGHTS_FILE, metadata={"format": "pt"})
+        text = json.dumps(self.config.to_dict(), indent=2) + "\n"
+        (save_directory / CONFIG_FILE).write_text(text, encoding="utf-8")
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls,
+        pretrained_model_name_or_path: str | Path,
+        *,
+        revision: str | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        token: str | bool | None = None,
+        device: str | torch.device = "cpu",
+    ) -> TextOCVP:
+        """Load a checkpoint, in evaluation mode.
+
+        Args:
+            pretrained_model_name_or_path: a folder, or else the id of a repository on the Hugging Face hub.
+            revision, cache_dir, local_files_only, token: as in `huggingface_hub.snapshot_download`; hub only.
+            device: where to put the model.
+
+        Raises:
+            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is named.
+        """
+        folder = Path(pretrained_model_name_or_path)
+        if not folder.is_dir():
+            try:
+                found = snapshot_download(
+                    str(pretrained_model_name_or_path),
+                    revision=revision,
+                    cache_dir=cache_dir,
+                    local_files_only=local_files_only,
+                    token=token,
+                    allow_patterns=[CONFIG_FILE, WEIGHTS_FILE],
+                )
+            # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
+            except Exception as error:
+                raise CheckpointError(
+                    f"{str(pretrained_model_name_or_path)!r} is no folder here, and fetching it from the Hugging Face "
+                    f"hub failed: {type(error).__name__}: {error}"
+                ) from error
+            folder = Path(found)
+        config = read_config(folder)
+        try:
+            model = cls(config)
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
+        load_weights(model, folder / WEIGHTS_FILE)
+        return model.to(device).eval()
+
+
+def read_config(folder: Path) -> ModelConfig:
+    """The configuration of the checkpoint in `folder`.
+
+    Raises:
+        CheckpointError: if there is no readable `config.json` there, or a field is unknown or missing.
+    """
+    path = folder / CONFIG_FILE
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and {WEIGHTS_FILE}"
+        ) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from error
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path} is damaged: it must hold one JSON object, not a {type(data).__name__}")
+    try:
+        return ModelConfig.from_dict(data)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+
+
+def load_weights(model: nn.Module, path: Path) -> None:
+    """Copy every tensor of a safetensors file into the model.
+
+    Raises:
+        CheckpointError: if the file is missing or damaged, or its tensors are not exactly the model's in name, shape
+            and kind of number.
+    """
+    try:
+        found = load_file(path)
+    except FileNotFoundError:
+        raise CheckpointError(f"{path.parent} is no checkpoint: there is no {path.name}") from None
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from error
+    wanted = model.state_dict()
+    for problem, names in (
+        ("lacks", wanted.keys() - found.keys()),
+        ("has what the model does not:", found.keys() - wanted.keys()),
+    ):
+        if names:
+            raise CheckpointError(f"{path} {problem} {_listed(sorted(names))}")
+    for name, tensor in wanted.items():
+        if _kind(found[name]) != _kind(tensor):
+            raise CheckpointError(
+                f"{path}: tensor {name!r} is {_described(found[name])}, the model's is {_described(tensor)}"
+            )
+    model.load_state_dict(found, strict=True)
+
+
+def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
+    # Weights may be stored in a shorter float; integers and floats must not be mixed up.
+    return tensor.shape, tensor.is_floating_point()
+
+
+def _described(tensor: Tensor) -> str:
+    return f"{tuple(tensor.shape)} {str(tensor.dtype).removeprefix('torch.')}"
+
+
+def _listed(names: list[str], most: int = 5) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"tensor{'s' if len(names) > 1 else ''} {', '.join(map(repr, names[:most]))}{more}"

@@ -1,0 +1,198 @@
+"""The published scene parser: slot attention for video (SAVi; TextOCVP section 3.1 and appendix, TextOCVP-SAVi).
+
+    frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transition -> next frame's first guess
+                                             ^ first frame: GaussianInitializer or clusters
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from textocvp.clustering import ClusterInitializer
+from textocvp.config import ParserConfig
+from textocvp.parser import Parsed, SceneParser
+from textocvp.slots import pixel_grid
+
+
+class PositionCode(nn.Module):
+    """Adds a learned linear code of each location's distance to the four edges to a feature map."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(4, channels)
+
+    def forward(self, features_BCHW: Tensor) -> Tensor:
+        H, W = features_BCHW.shape[-2:]
+        grid_HW2 = pixel_grid(H, W, device=features_BCHW.device)
+        edges_HW4 = torch.cat([1 + grid_HW2, 1 - grid_HW2], dim=-1) / 2  # 0..1 from left, top, right, bottom
+        return features_BCHW + self.project(edges_HW4).permute(2, 0, 1)
+
+
+class ConvEncoder(nn.Module):
+    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code, location-wise MLP.
+
+    Args:
+        channels: width of the convolutions (32 in the paper).
+        stride: stride of the first one (1 in the paper: features at every pixel).
+        out_dim: D, the slots' width.
+    """
+
+    def __init__(self, channels: int, stride: int, out_dim: int) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, channels, 5, stride=stride, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+        )
+        self.position = PositionCode(channels)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(channels), nn.Linear(channels, out_dim), nn.ReLU(), nn.Linear(out_dim, out_dim)
+        )
+
+    def forward(self, frames_N3HW: Tensor) -> Tensor:
+        features_NCHW = self.position(self.convolutions(frames_N3HW))
+        return self.mlp(features_NCHW.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class GaussianInitializer(nn.Module):
+    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test time."""
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
+
+    def forward(self, batch: int, num_slots: int, generator: torch.Generator | None = None) -> Tensor:
+        """(batch, num_slots, D) slots."""
+        noise_BKD = torch.randn(
+            batch, num_slots, self.mean.shape[0], generator=generator, device=self.mean.device, dtype=self.mean.dtype
+        )
+        return self.mean + self.log_deviation.exp() * noise_BKD
+
+
+class ClusterSlots(nn.Module):
+    """First slots from clusters of colour and place: the mean feature of each cluster, through a small MLP.
+
+    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
+    family a slot has no presence that could switch it off.
+    """
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.clusters = ClusterInitializer()
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
+        )
+        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+
+    def forward(self, frames_B3HW: Tensor, features_BDhw: Tensor, num_slots: int) -> Tensor:
+        """(B, num_slots, D) slots."""
+        found = self.clusters(frames_B3HW, num_slots)
+        shares_BKL = F.adaptive_avg_pool2d(found.masks, features_BDhw.shape[-2:]).flatten(2)
+        shares_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
+        slots_BKD = self.mlp(shares_BKL @ features_BDhw.flatten(2).transpose(1, 2))
+        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty)
+
+
+class SlotAttention(nn.Module):
+    """The corrector: slots compete for locations, then each is updated with the mean of what it won.
+
+    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the locations; the update
+    is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
+    """
+
+    def __init__(self, slot_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.norm_features = nn.LayerNorm(slot_dim)
+        self.norm_slots = nn.LayerNorm(slot_dim)
+        self.norm_mlp = nn.LayerNorm(slot_dim)
+        self.query = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.key = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.value = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.gru = nn.GRUCell(slot_dim, slot_dim)
+        self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
+
+    def forward(self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the slots.
+
+        Raises:
+            ValueError: if `iterations` is below 1.
+        """
+        if iterations < 1:
+            raise ValueError(f"slot attention needs at least 1 iteration, not {iterations}")
+        B, K, D = slots_BKD.shape
+        features_BLD = self.norm_features(features_BLD)
+        keys_BLD, values_BLD = self.key(features_BLD), self.value(features_BLD)
+        for _ in range(iterations):
+            queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
+            attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
+            # The small constant keeps a slot that won nothing at the mean of all locations instead of at 0/0.
+            weights_BKL = attention_BKL + 1e-8
+            weights_BKL = weights_BKL / weights_BKL.sum(dim=-1, keepdim=True)
+            updates_BKD = weights_BKL.to(values_BLD.dtype) @ values_BLD
+            slots_BKD = self.gru(updates_BKD.flatten(0, 1), slots_BKD.flatten(0, 1)).view(B, K, D)
+            slots_BKD = slots_BKD + self.mlp(self.norm_mlp(slots_BKD))
+        return slots_BKD, attention_BKL
+
+
+class SaviParser(SceneParser):
+    """Slot attention for video over clips.
+
+    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ unless the
+    same generator state is given.
+
+    Raises:
+        ValueError: if the layout has explicit channels (this corrector gives content only), or the initializer is
+            unknown.
+    """
+
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        if config.layout.explicit:
+            raise ValueError("parser.corrector 'slot_attention' needs parser.layout.explicit = false")
+        if config.initializer not in ("gaussian", "cluster"):
+            raise ValueError(f"unknown parser.initializer {config.initializer!r}; known: gaussian, cluster")
+        self.config = config
+        self.layout = config.layout
+        dim = config.layout.dim
+        self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
+        self.initializer = GaussianInitializer(dim) if config.initializer == "gaussian" else ClusterSlots(dim)
+        self.corrector = SlotAttention(dim, hidden=2 * dim)
+        # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
+        self.transition = nn.TransformerEncoderLayer(
+            dim, config.transition_heads, config.transition_hidden, dropout=0.0, batch_first=True, norm_first=True
+        )
+
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Parsed:
+        B, T = frames_BT3HW.shape[:2]
+        K = self.config.num_slots if num_slots is None else num_slots
+        features_NDhw = self.encoder(frames_BT3HW.flatten(0, 1))
+        h, w = features_NDhw.shape[-2:]
+        features_BTLD = features_NDhw.flatten(2).transpose(1, 2).unflatten(0, (B, T))
+
+        if isinstance(self.initializer, GaussianInitializer):
+            guess_BKD = self.initializer(B, K, generator)
+        else:
+            guess_BKD = self.initializer(frames_BT3HW[:, 0], features_NDhw.unflatten(0, (B, T))[:, 0], K)
+        slots, attention = [], []
+        for t in range(T):
+            rounds = self.config.iterations_first if t == 0 else self.config.iterations_next
+            slots_BKD, attention_BKL = self.corrector(guess_BKD, features_BTLD[:, t], rounds)
+            slots.append(slots_BKD)
+            attention.append(attention_BKL.unflatten(2, (h, w)))
+            if t + 1 < T:
+                guess_BKD = self.transition(slots_BKD)
+        return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1))

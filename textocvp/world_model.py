@@ -1,0 +1,268 @@
+"""The world model as users meet it: load a checkpoint, give it an observation and a sentence, get a `Rollout`."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, TextOCVP
+from textocvp.rollout import Rollout
+
+DEFAULT_CHECKPOINT = "tabletop-small"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where a model came from.
+
+    Attributes:
+        name: the bundled name, the folder or the hub id that was asked for.
+        sha256: of its `model.safetensors`; empty for a model that was never saved.
+    """
+
+    name: str
+    sha256: str = ""
+
+
+def bundled_checkpoints() -> list[str]:
+    """Names of the checkpoints that come with the package."""
+    root = files("textocvp") / "checkpoints"
+    if not root.is_dir():
+        return []
+    return sorted(folder.name for folder in root.iterdir() if (folder / CONFIG_FILE).is_file())
+
+
+class WorldModel:
+    """Imagines what happens to a scene when a sentence is carried out.
+
+    Attributes:
+        model: the network.
+        checkpoint: where it came from.
+    """
+
+    def __init__(self, model: TextOCVP, checkpoint: Checkpoint | None = None) -> None:
+        self.model = model.eval()
+        self.checkpoint = checkpoint or Checkpoint(model.config.name)
+
+    @classmethod
+    def from_pretrained(
+        cls, name_or_folder_or_hub_id: str | Path = DEFAULT_CHECKPOINT, device: str | torch.device = "cpu"
+    ) -> WorldModel:
+        """Load a checkpoint.
+
+        Args:
+            name_or_folder_or_hub_id: a bundled name (`bundled_checkpoints()`), else a folder, else the id `owner/name`
+                of a repository on the Hugging Face hub.
+            device: where the model computes.
+
+        Raises:
+            CheckpointError: if there is no such checkpoint (the message lists the bundled ones), or it is damaged.
+        """
+        name = str(name_or_folder_or_hub_id)
+        if name in bundled_checkpoints():
+            with as_file(files("textocvp") / "checkpoints" / name) as folder:
+                return cls._from_folder(folder, name, device)
+        if Path(name).is_dir():
+            return cls._from_folder(Path(name), name, device)
+        bundled = ", ".join(bundled_checkpoints()) or "none"
+        allowed = (
+            f"Bundled checkpoints: {bundled}. Else give a folder that contains {CONFIG_FILE} and {WEIGHTS_FILE}, or the "
+            "id owner/name of a repository on the Hugging Face hub that does."
+        )
+        if name.count("/") != 1 or name.startswith((".", "/", "~")):
+            raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
+        try:
+            model = TextOCVP.from_pretrained(name, device=device)
+        except CheckpointError as error:
+            raise CheckpointError(f"unknown checkpoint {name!r}: {error}. {allowed}") from error
+        return cls(model, Checkpoint(name))
+
+    @classmethod
+    def _from_folder(cls, folder: Path, name: str, device: str | torch.device) -> WorldModel:
+        model = TextOCVP.from_pretrained(folder, device=device)
+        return cls(model, Checkpoint(name, hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()))
+
+    def __repr__(self) -> str:
+        config = self.model.config
+        million = sum(p.numel() for p in self.model.parameters()) / 1e6
+        side = config.parser.image_size
+        return (
+            f"WorldModel({self.checkpoint.name!r}, {million:.1f} M parameters, {side}x{side} frames, "
+            f"{config.parser.num_slots} slots, up to {self.longest_horizon} frames ahead, on {self.model.device})"
+        )
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) of the only frames that it understands, in pixels."""
+        side = self.model.config.parser.image_size
+        return side, side
+
+    @property
+    def longest_horizon(self) -> int | None:
+        """How many frames it can imagine at once; None for as many as you like (the published moving window)."""
+        predictor = self.model.config.predictor
+        return predictor.window if predictor.attention == "causal" else None
+
+    @torch.no_grad()
+    def rollout(
+        self,
+        obs: Mapping[str, Any] | np.ndarray | Rollout,
+        text: str | Sequence[str],
+        *,
+        horizon: int = 24,
+        seed: int = 0,
+        attention: bool = False,
+        use_cache: bool = True,
+    ) -> Rollout:
+        """Imagine the next `horizon` frames.
+
+        One scene and n texts give n sequences over one parsed scene; n scenes and n texts go together pairwise; n
+        scenes and one text all get that text.
+
+        Args:
+            obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images
+                (B, H, W, 3), uint8; or a rollout, to go on from its last slots.
+            text: what is to be done.
+            horizon: how many frames to imagine after the one that is seen.
+            seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
+            attention: also keep the weights from slots to words.
+            use_cache: reuse the keys and values of past frames; without it they are computed again at every step
+                (slower, the same up to rounding; for checks).
+
+        Returns:
+            a rollout of `horizon + 1` frames, the first of which is the parsed observation.
+
+        Raises:
+            TypeError: if the observation is not uint8 or none of the above.
+            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says what is.
+
+        A word that the text encoder has never met is a `UserWarning` that names the word.
+        """
+        texts = self._checked_texts(text)
+        longest = self.longest_horizon
+        if not isinstance(horizon, (int, np.integer)) or horizon < 1:
+            raise ValueError(f"horizon must be a whole number of at least 1 frame, not {horizon!r}")
+        if longest is not None and horizon > longest:
+            raise ValueError(
+                f"horizon {horizon} is longer than this model was trained for: at most {longest}. To see further, go on "
+                "from where a rollout ended: rollout(previous_rollout, text)"
+            )
+        slots_BKD = self._first_slots(obs, seed)
+        scenes, sentences = slots_BKD.shape[0], len(texts)
+        if scenes != sentences and scenes != 1 and sentences != 1:
+            raise ValueError(
+                f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as many of "
+                "each"
+            )
+        B = max(scenes, sentences)
+        texts = texts * B if sentences == 1 else texts
+        seed_B1KD = slots_BKD.expand(B, -1, -1)[:, None]
+        imagined = self.model.predictor.rollout(
+            seed_B1KD, self.model.text(texts), horizon, use_cache=use_cache, return_attention=attention
+        )
+        slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
+        return self._as_rollout(slots_BTKD, tuple(texts), imagined.attention_BSnhKL)
+
+    @torch.no_grad()
+    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+        """Slots of true frames, nothing imagined: what a perfect prediction would be measured at.
+
+        Args:
+            video: (T, H, W, 3) or (B, T, H, W, 3) uint8.
+            seed: of the initial slots.
+
+        Raises:
+            TypeError, ValueError: as `rollout`.
+        """
+        frames = np.asarray(video)
+        if frames.ndim == 4:
+            frames = frames[None]
+        if frames.ndim != 5:
+            raise ValueError(f"video must be (T, H, W, 3) or (B, T, H, W, 3), not {np.asarray(video).shape}")
+        B, T = frames.shape[:2]
+        flat_N3HW = self._checked_images(frames.reshape(-1, *frames.shape[2:]), "video")
+        parsed = self.model.parser(flat_N3HW.unflatten(0, (B, T)), generator=self._generator(seed))
+        return self._as_rollout(parsed.slots_BTKD.float(), (), None)
+
+    # ---------------------------------------------------------------- checks
+
+    def _first_slots(self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int) -> Tensor:
+        if isinstance(obs, Rollout):
+            if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
+                raise ValueError(
+                    f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} pixels, "
+                    f"this model's are {self.model.parser.layout} at {self.image_size}"
+                )
+            return obs.slots[:, -1].to(self.model.device)
+        if isinstance(obs, Mapping):
+            if "rgb" not in obs:
+                raise ValueError(f"the observation has no 'rgb'; it has {', '.join(map(repr, obs)) or 'nothing'}")
+            obs = obs["rgb"]
+        images = np.asarray(obs)
+        if images.ndim == 3:
+            images = images[None]
+        if images.ndim != 4:
+            raise ValueError(f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}")
+        frames_B3HW = self._checked_images(images, "the observation")
+        return self.model.parser(frames_B3HW[:, None], generator=self._generator(seed)).slots_BTKD[:, 0]
+
+    def _checked_images(self, images: np.ndarray, what: str) -> Tensor:
+        """(N, H, W, 3) uint8 images as frames (N, 3, H, W) in -1..1 on the model's device."""
+        H, W = self.image_size
+        if images.dtype != np.uint8:
+            hint = ""
+            if np.issubdtype(images.dtype, np.floating) and images.size and 0 <= images.min() <= images.max() <= 1:
+                hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)"
+            raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
+        if images.shape[-1] != 3 or images.shape[0] == 0:
+            raise ValueError(f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}")
+        if images.shape[1:3] != (H, W):
+            raise ValueError(
+                f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} and no other "
+                "size: render or resize to that"
+            )
+        if images.max() == 1:
+            raise ValueError(f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255")
+        frames_NHW3 = torch.from_numpy(np.ascontiguousarray(images)).to(self.model.device)
+        return frames_NHW3.permute(0, 3, 1, 2).float() / 127.5 - 1
+
+    def _checked_texts(self, text: str | Sequence[str]) -> list[str]:
+        texts = [text] if isinstance(text, str) else list(text)
+        if not texts:
+            raise ValueError("no text: give one sentence or several")
+        for sentence in texts:
+            if not isinstance(sentence, str):
+                raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
+            if not sentence.strip():
+                raise ValueError('an empty text; say what is to be done, for example "put the red block in the blue bowl"')
+        unknown = list(dict.fromkeys(word for sentence in texts for word in self.model.text.unknown_words(sentence)))
+        if unknown:
+            words = ", ".join(map(repr, unknown))
+            warnings.warn(
+                f"the text encoder has never met {words}; what is imagined may ignore {'them' if len(unknown) > 1 else 'it'}",
+                UserWarning,
+                stacklevel=3,
+            )
+        return texts
+
+    def _generator(self, seed: int) -> torch.Generator:
+        return torch.Generator(device=self.model.device).manual_seed(seed)
+
+    def _as_rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...], attention: Tensor | None) -> Rollout:
+        return Rollout(
+            slots=slots_BTKD,
+            texts=texts,
+            image_size=self.image_size,
+            layout=self.model.parser.layout,
+            renderer=self.model.renderer,
+            attention=attention,
+        )
