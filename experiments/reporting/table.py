@@ -1,0 +1,90 @@
+"""A table of figures, drawn the same way in the terminal, in HTML and in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from rich import box
+from rich.table import Table as RichTable
+
+from experiments.reporting.results import Row
+
+Kind = Literal["ours", "control", "ceiling", "paper"]
+
+_STYLES: dict[Kind, str] = {"ours": "bold", "control": "dim", "ceiling": "", "paper": "italic cyan"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure: its text, and its interval as text (empty when there is none)."""
+
+    text: str
+    interval: str = ""
+    n: int | None = None
+
+    @classmethod
+    def of(cls, row: Row | None, digits: int = 2) -> Cell:
+        """The cell of a row; a dash while there is none yet."""
+        if row is None:
+            return cls("–")
+        interval = f"{row.low:.{digits}f}–{row.high:.{digits}f}"
+        return cls(f"{row.value:.{digits}f}", "" if row.low == row.high else interval, row.n)
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One line: its label, its cells, and its part in the argument.
+
+    Attributes:
+        kind: `ours`, a `control` that must be low, a `ceiling` above all, or the `paper`'s own figures.
+        note: one sentence that says how the line was measured.
+    """
+
+    label: str
+    cells: Sequence[Cell]
+    kind: Kind = "ours"
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Title, columns and rows. Every row has one cell a column."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[TableRow] = field(default_factory=list)
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row.cells) != len(self.columns):
+                raise ValueError(
+                    f"row {row.label!r} has {len(row.cells)} cells, the table {len(self.columns)} columns"
+                )
+
+    def to_rich(self, intervals: bool = True) -> RichTable:
+        """For the terminal."""
+        table = RichTable(title=self.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+        table.caption, table.caption_justify, table.caption_style = self.caption or None, "left", "dim"
+        table.add_column("")
+        for column in self.columns:
+            table.add_column(column, justify="right")
+        for row in self.rows:
+            cells = [
+                f"{c.text}\n[dim not bold not italic]{c.interval}[/]" if intervals and c.interval else c.text
+                for c in row.cells
+            ]
+            table.add_row(row.label, *cells, style=_STYLES[row.kind])
+        return table
+
+    def to_markdown(self) -> str:
+        """For a README."""
+        lines = [
+            f"| {self.title} | " + " | ".join(self.columns) + " |",
+            "|---" * (len(self.columns) + 1) + "|",
+        ]
+        for row in self.rows:
+            lines.append(f"| {row.label} | " + " | ".join(c.text for c in row.cells) + " |")
+        return "\n".join(lines) + "\n"
