@@ -1,0 +1,103 @@
+"""Text encoders: what they know, what padding does, and that colours are looked up, not learned by name."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from textocvp.config import TextConfig
+from textocvp.lexicon import TABLEAU_10, color_of, palette
+from textocvp.text import COLOR, TextEncoder
+
+CAPTION = "put the red block in the gray bowl"
+
+
+def encoder(kind: str) -> TextEncoder:
+    torch.manual_seed(0)
+    return TextEncoder(TextConfig(kind=kind, dim=32, hidden=64)).eval()
+
+
+@pytest.mark.parametrize("kind", ["transformer", "lexicon"])
+def test_padding_changes_nothing(kind):
+    model = encoder(kind)
+    alone = model([CAPTION])
+    longer = "put the red block in the gray bowl and the blue block in the green bowl"
+    together = model([CAPTION, longer])
+    length = alone.mask_BL.shape[1]
+    assert together.mask_BL.sum(dim=1).tolist() == [8, 16]
+    torch.testing.assert_close(together.embeddings_BLC[:1, :length], alone.embeddings_BLC)
+    assert together.embeddings_BLC[0, length:].abs().max() == 0
+
+
+@pytest.mark.parametrize("kind", ["transformer", "lexicon"])
+def test_word_order_and_every_word_matter(kind):
+    model = encoder(kind)
+    tokens = model([CAPTION, "put the gray block in the red bowl"]).embeddings_BLC
+    assert (tokens[0] - tokens[1]).abs().amax(dim=-1).min() > 1e-4
+
+
+def test_unknown_words_are_named_once_and_in_order():
+    assert encoder("lexicon").unknown_words("Put the Zorble block in the wug bowl, zorble!") == [
+        "zorble",
+        "wug",
+    ]
+    assert encoder("lexicon").unknown_words("put the turquoise block in the light blue bowl") == []
+    assert encoder("transformer").unknown_words("put the red block in the turquoise bowl") == ["turquoise"]
+
+
+def test_colors_of_the_lexicon_differ_in_rgb_only():
+    model = encoder("lexicon")
+    words = model.lookup(["put the red block in the turquoise bowl"])
+    named = words.names_color_BL[0]
+    assert named.tolist() == [False, False, True, False, False, False, True, False]
+    assert (words.ids_BL[0][named] == COLOR).all()
+    torch.testing.assert_close(words.colors_BL3[0, 2], torch.tensor(color_of("red")) * 2 - 1)
+    assert (words.colors_BL3[0][~named] == 0).all()
+    assert not encoder("transformer").lookup([CAPTION]).names_color_BL.any()
+
+
+def test_a_color_name_of_two_words_is_one_token():
+    assert encoder("lexicon").words("Put the light blue block") == ["put", "the", "light blue", "block"]
+    assert encoder("transformer").words("Put the light blue block") == [
+        "put",
+        "the",
+        "light",
+        "blue",
+        "block",
+    ]
+
+
+def test_palettes_are_asked_in_order():
+    assert color_of("Red") == pytest.approx((225 / 255, 87 / 255, 89 / 255))  # Tableau, not CSS or XKCD
+    assert color_of("turquoise") == pytest.approx((64 / 255, 224 / 255, 208 / 255))  # CSS, not XKCD
+    assert color_of("windows blue") is not None  # XKCD only
+    assert color_of("wug") is None
+    assert len(palette()) > 900 and len(TABLEAU_10) == 12
+
+
+def test_channel_permutation_moves_colors_only():
+    words = encoder("lexicon").lookup([CAPTION, CAPTION])
+    order = torch.tensor([[2, 0, 1], [0, 1, 2]])
+    permuted = words.permute_channels(order)
+    torch.testing.assert_close(permuted.colors_BL3[0], words.colors_BL3[0][:, [2, 0, 1]])
+    torch.testing.assert_close(permuted.colors_BL3[1], words.colors_BL3[1])
+    assert permuted.ids_BL is words.ids_BL
+
+
+def test_bad_texts():
+    model = encoder("lexicon")
+    for empty in ("", "  ", "?!"):
+        with pytest.raises(ValueError, match="at least one word"):
+            model([CAPTION, empty])
+    with pytest.raises(ValueError, match="at most 64 words"):
+        model(["put " * 65])
+    with pytest.raises(TypeError, match="sequence of sentences"):
+        model(CAPTION)
+
+
+def test_gradients_reach_every_parameter_that_was_used():
+    model = encoder("lexicon")
+    model([CAPTION]).embeddings_BLC.square().sum().backward()
+    unused = [name for name, p in model.named_parameters() if p.grad is None]
+    assert unused == []
+    assert model.color_projection.weight.grad.abs().max() > 0
