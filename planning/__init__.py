@@ -12,8 +12,8 @@ Judging rollouts without a robot (the predicted study):
     camera = PinholeCamera.from_info(info["camera"])
     instruction = Instruction.parse(text)                       # block colour, bowl colour
     rollout = world_model.rollout(obs, [text] * n)
-    groundings = ground(rollout, camera)                        # one a batch item, or pass one for all of them
-    trace = measure_rollout(rollout, groundings, instruction)   # distances in pixels, (B, T)
+    groundings = ground(rollout, camera)                        # one a batch item, or pass one for all of
+    them trace = measure_rollout(rollout, groundings, instruction)   # distances in pixels, (B, T)
     success_B = Judge()(trace)
 
 Nothing here reads the simulator's state, except `ground_privileged`, whose name says so.
@@ -23,9 +23,10 @@ from planning.camera import PinholeCamera
 from planning.controller import Controller, PickAndPlace
 from planning.goals import Goal, Instruction, Thing
 from planning.grounding import AppearanceGrounder, Grounding, GroundingError, ground
-from planning.loop import Attempt, EpisodeResult, goal_reached, run_episode
+from planning.loop import Attempt, EpisodeResult, run_episode
 from planning.planners import Candidate, Imagines, InstructionPlanner, Plan, Planner, RandomPlanner
 from planning.privileged import PrivilegedGrounder, ground_privileged
+from planning.progress import goal_reached
 from planning.scores import (
     CarryScore,
     Judge,

@@ -1,4 +1,6 @@
-"""A calibrated camera: the one thing, besides its own picture, that the planner knows about the robot's cell."""
+"""A calibrated camera: the one thing, besides its own picture, that the planner knows about the robot's
+cell.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ class PinholeCamera:
     def from_info(cls, camera: Mapping[str, Any]) -> PinholeCamera:
         """From `info["camera"]` of the environments, which has `intrinsics` and `extrinsics`."""
         return cls(
-            np.asarray(camera["intrinsics"], dtype=np.float64), np.asarray(camera["extrinsics"], dtype=np.float64)
+            np.asarray(camera["intrinsics"], dtype=np.float64),
+            np.asarray(camera["extrinsics"], dtype=np.float64),
         )
 
     def project(self, points: ArrayLike) -> Array:
@@ -53,7 +56,8 @@ class PinholeCamera:
         return points @ self.extrinsics[2, :3] + self.extrinsics[2, 3]
 
     def unproject_to_plane(self, pixels: ArrayLike, z: float) -> Array:
-        """Pixels (..., 2) -> the world points (..., 3) in metres that they show at height `z` above the table.
+        """Pixels (..., 2) -> the world points (..., 3) in metres that they show at height `z` above the
+        table.
 
         Raises:
             ValueError: if a pixel's ray does not meet that plane in front of the camera.
@@ -70,6 +74,8 @@ class PinholeCamera:
         return center + reach * rays
 
     def metres_per_pixel(self, pixels: ArrayLike, z: float) -> Array:
-        """How many metres one pixel spans across the line of sight, where pixels (..., 2) show height `z`: (...)."""
+        """How many metres one pixel spans across the line of sight, where pixels (..., 2) show height `z`:
+        (...).
+        """
         focal = float(self.intrinsics[0, 0])
         return self.depth(self.unproject_to_plane(pixels, z)) / focal

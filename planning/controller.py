@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
 from planning.goals import Instruction
-from planning.grounding import Grounding
+from planning.grounding import Grounding, hard_masks
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -34,7 +35,8 @@ class Controller:
 
     Attributes:
         camera: of the scene.
-        pick_height: height above the table, in metres, of the point that a block's slot is centred on when it stands.
+        pick_height: height above the table, in metres, of the point that a block's slot is centred on when it
+            stands.
         place_height: the same when it lies in a bowl.
     """
 
@@ -47,5 +49,26 @@ class Controller:
 
         Args:
             instruction: the one that was imagined; its block is the one that moves.
+
+        Raises:
+            GroundingError: if the block is not in the grounding.
+            ValueError: if it ends outside the camera's view of the table.
         """
-        raise NotImplementedError
+        slots = list(grounding.find(instruction.block_thing))
+        start, end = (slot_center(rollout, slots, frame) for frame in (0, rollout.slots.shape[1] - 1))
+        pick = self.camera.unproject_to_plane(start, self.pick_height)
+        place = self.camera.unproject_to_plane(end, self.place_height)
+        return PickAndPlace((float(pick[0]), float(pick[1])), (float(place[0]), float(place[1])))
+
+
+def slot_center(rollout: Rollout, slots: Sequence[int], frame: int) -> NDArray[np.float64]:
+    """Where an object is in one frame of a rollout (B = 1): (x, y) in pixels.
+
+    The slot's own position; for an object of several slots their mean, weighted by the pixels each of them
+    wins.
+    """
+    positions_k2 = rollout.positions[0, frame, list(slots)].double().cpu().numpy()
+    if len(slots) == 1:
+        return positions_k2[0]
+    area_k = hard_masks(rollout.decode_masks([frame])[0, 0])[list(slots)].sum((1, 2)).double().cpu().numpy()
+    return np.average(positions_k2, axis=0, weights=area_k + 1e-6)

@@ -73,8 +73,8 @@ class Goal:
 
     @classmethod
     def parse(cls, text: str) -> Goal:
-        """All pairs that an instruction of one or several steps names, as in "put the red block in the blue bowl and the
-        green block in the gray bowl".
+        """All pairs that an instruction of one or several steps names, as in "put the red block in the blue
+        bowl and the green block in the gray bowl".
 
         Raises:
             ValueError: if it names none, or one block twice.

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.controller import PickAndPlace
+from planning.camera import PinholeCamera
+from planning.controller import Controller, PickAndPlace
 from planning.goals import Goal, Instruction
-from planning.grounding import Grounding
+from planning.grounding import AppearanceGrounder, Grounder, GroundingError
 from planning.planners import Plan, Planner
+from planning.privileged import PrivilegedGrounder
+from planning.progress import goal_reached
 
 if TYPE_CHECKING:
     import gymnasium
-
-    from textocvp.rollout import Rollout
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +28,14 @@ class Attempt:
     Attributes:
         rgb: (H, W, 3) the observation that was planned from.
         plan: what the planner decided.
+        instruction: the step of that plan that was carried out.
         action: what was done.
         believes_reached: whether the planner's own eyes say afterwards that the goal is reached.
     """
 
     rgb: NDArray[np.uint8]
     plan: Plan
+    instruction: Instruction
     action: PickAndPlace
     believes_reached: bool
 
@@ -46,7 +49,8 @@ class EpisodeResult:
         believes_reached: the planner's own verdict at that moment.
         attempts: the turns of the loop; empty if the scene could not be grounded.
         error: why the loop gave up, or None.
-        frames: (T, H, W, 3) what the camera saw, first observation included (with `record_frames`, all of it).
+        frames: (T, H, W, 3) what the camera saw, first observation included (with `record_frames`, all of
+            it).
     """
 
     success: bool
@@ -66,11 +70,6 @@ class EpisodeResult:
         return float(np.mean([a.plan.seconds for a in self.attempts])) if self.attempts else float("nan")
 
 
-def goal_reached(parsed: Rollout, grounding: Grounding, goal: Goal) -> bool:
-    """Whether every block of the goal is seen inside its bowl (its centroid within the bowl's outline)."""
-    raise NotImplementedError
-
-
 def run_episode(
     env: gymnasium.Env[Any, Any],
     planner: Planner,
@@ -88,10 +87,60 @@ def run_episode(
 
     Args:
         goal: by default what the environment's instruction says.
-        seed, options: for `env.reset`; for a variant of a scene pass `options={"instruction": ...}`, so that the
-            simulator judges the goal that is pursued.
+        seed, options: for `env.reset`; for a variant of a scene pass `options={"instruction": ...}`, so that
+            the simulator judges the goal that is pursued.
         max_attempts: pick-and-places at most (per pair of the goal).
-        replan: look again after each action, and go on while the goal is not reached. Otherwise one action a pair.
+        replan: look again after each action, and plan anew while the goal is not reached. Otherwise one plan
+            is made and carried out to its end.
         privileged: ground with the simulator's segmentation instead (the control column of that name).
+
+    Raises:
+        ValueError: if the environment is not in `primitive` control.
     """
-    raise NotImplementedError
+    observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
+    rgb = observation["rgb"]
+    goal = Goal.parse(info["instruction"]) if goal is None else goal
+    camera = PinholeCamera.from_info(info["camera"])
+    controller = Controller(camera)
+    frames, attempts, queue = [rgb[None]], [], []
+    reached, error = False, None
+    for _ in range(max_attempts * len(goal.pairs)):
+        try:
+            if not queue:
+                plan = planner.plan(rgb, goal, _grounder(info, camera, privileged))
+                queue = list(zip(plan.best.instructions, plan.rollouts, strict=True))
+            instruction, rollout = queue.pop(0)
+            action = controller.act(rollout, plan.grounding, instruction)
+        except (GroundingError, ValueError) as problem:
+            error = f"{type(problem).__name__}: {problem}"
+            break
+        seen = rgb
+        observation, _, terminated, truncated, info = env.step(action.to_action())
+        rgb = observation["rgb"]
+        frames.append(_frames(info, rgb))
+        reached = _looks_reached(planner, rgb, goal, _grounder(info, camera, privileged))
+        attempts.append(Attempt(seen, plan, instruction, action, reached))
+        if replan:
+            queue = []
+        if terminated or truncated or (reached if replan else not queue):
+            break
+    return EpisodeResult(bool(info["is_success"]), reached, tuple(attempts), error, np.concatenate(frames))
+
+
+def _grounder(info: Mapping[str, Any], camera: PinholeCamera, privileged: bool) -> Grounder:
+    if privileged:
+        return PrivilegedGrounder(info["segmentation"], info["objects"])
+    return AppearanceGrounder(camera)
+
+
+def _looks_reached(planner: Planner, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> bool:
+    parsed = planner.world_model.parse(rgb[None])
+    try:
+        return goal_reached(parsed, grounder(parsed).told(goal.things), goal)
+    except GroundingError:  # what cannot be seen is not known to be reached
+        return False
+
+
+def _frames(info: Mapping[str, Any], rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """What the camera saw during a primitive, or only its end where the environment records no frames."""
+    return np.asarray(info["frames"]) if "frames" in info else rgb[None]

@@ -1,8 +1,8 @@
 """From masks to distances, and from distances to success and scores.
 
-`measure` turns the masks of arm, block and bowl into a `Trace` of two distances a frame. Everything else reads a
-`Trace`: the `Judge` says whether the instruction was carried out, a `Score` ranks candidates. Scores compose, and
-none of them knows where the masks came from.
+`measure` turns the masks of arm, block and bowl into a `Trace` of two distances a frame. Everything else
+reads a `Trace`: the `Judge` says whether the instruction was carried out, a `Score` ranks candidates. Scores
+compose, and none of them knows where the masks came from.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from planning.goals import Instruction
-from planning.grounding import Grounding, hard_masks
+from planning.grounding import Grounding
 from planning.thresholds import THRESHOLDS, Thresholds
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ class Trace:
 
     Attributes:
         frames: (t,) increasing indices of those frames in the rollout.
-        arm_block_Bt: smallest distance between a pixel of the arm and a pixel of the block, in pixels; inf in frames
-            where one of them is not seen.
+        arm_block_Bt: smallest distance between a pixel of the arm and a pixel of the block, in pixels; inf in
+            frames where one of them is not seen.
         block_bowl_Bt: distance between the centroids of block and bowl, in pixels; inf as above.
     """
 
@@ -39,8 +39,22 @@ class Trace:
     arm_block_Bt: Tensor
     block_bowl_Bt: Tensor
 
+    def then(self, later: Trace, length: int) -> Trace:
+        """This trace and a later one that starts where this one's rollout of `length` frames ends."""
+        return Trace(
+            self.frames + tuple(length + frame for frame in later.frames),
+            torch.cat([self.arm_block_Bt, later.arm_block_Bt], dim=1),
+            torch.cat([self.block_bowl_Bt, later.block_bowl_Bt], dim=1),
+        )
+
+    def select(self, index: Sequence[int]) -> Trace:
+        """The trace of some of the rollouts."""
+        keep = list(index)
+        return Trace(self.frames, self.arm_block_Bt[keep], self.block_bowl_Bt[keep])
+
     def held(self, within: float) -> Tensor:
-        """The longest unbroken run of frames with the arm at most `within` pixels from the block, (B,) in frames.
+        """The longest unbroken run of frames with the arm at most `within` pixels from the block, (B,) in
+        frames.
 
         Between two looked-at neighbours that both hold, the frames skipped are taken to hold as well.
         """
@@ -65,8 +79,8 @@ def arm_block_distance(arm_NHW: Tensor, block_NHW: Tensor) -> Tensor:
     """
     lead, (height, width) = arm_NHW.shape[:-2], arm_NHW.shape[-2:]
     arm_NHW, block_NHW = arm_NHW.reshape(-1, height, width), block_NHW.reshape(-1, height, width)
-    # First the vertical distance to the arm within each column (two running maxima), then, only at the block's few
-    # pixels, the best column: an exact distance transform evaluated where it is needed.
+    # First the vertical distance to the arm within each column (two running maxima), then, only at the
+    # block's few pixels, the best column: an exact distance transform evaluated where it is needed.
     rows_H1 = torch.arange(height, dtype=torch.float32)[:, None]
     far = 4.0 * (height + width)
     above_NHW = rows_H1 - torch.where(arm_NHW, rows_H1, -far).cummax(1).values
@@ -91,11 +105,15 @@ def centroids(masks_NHW: Tensor) -> Tensor:
 
 
 def block_bowl_distance(block_NHW: Tensor, bowl_NHW: Tensor) -> Tensor:
-    """Distance between the centroids of two bool masks (..., H, W), in pixels; inf where one is empty: (...)."""
+    """Distance between the centroids of two bool masks (..., H, W), in pixels; inf where one is empty:
+    (...).
+    """
     return (centroids(block_NHW) - centroids(bowl_NHW)).norm(dim=-1).nan_to_num(nan=UNSEEN)
 
 
-def measure(arm_BtHW: Tensor, block_BtHW: Tensor, bowl_BtHW: Tensor, frames: Sequence[int] | None = None) -> Trace:
+def measure(
+    arm_BtHW: Tensor, block_BtHW: Tensor, bowl_BtHW: Tensor, frames: Sequence[int] | None = None
+) -> Trace:
     """The trace of B clips whose bool masks (B, t, H, W) of arm, block and bowl are given.
 
     Args:
@@ -123,7 +141,8 @@ def measure_rollout(
     *,
     frames: Sequence[int] | None = None,
 ) -> Trace:
-    """The trace of a batch of rollouts, each with respect to one instruction (not necessarily the one imagined).
+    """The trace of a batch of rollouts, each with respect to one instruction (not necessarily the one
+    imagined).
 
     Args:
         groundings: which slot is what; one for all B rollouts, or one each.
@@ -132,34 +151,40 @@ def measure_rollout(
 
     Raises:
         ValueError: if there is neither one grounding (instruction) nor B.
-        KeyError: if a grounding does not have the block or bowl.
+        GroundingError: if a grounding does not have the block or bowl.
     """
     batch, length = rollout.slots.shape[:2]
-    groundings = _one_each(groundings, Grounding, batch, "groundings")
-    instructions = _one_each(instructions, Instruction, batch, "instructions")
+    each_grounding = [groundings] * batch if isinstance(groundings, Grounding) else list(groundings)
+    each_instruction = [instructions] * batch if isinstance(instructions, Instruction) else list(instructions)
+    for values, name in ((each_grounding, "groundings"), (each_instruction, "instructions")):
+        if len(values) != batch:
+            raise ValueError(f"{batch} rollouts need one or {batch} {name}, got {len(values)}")
     frames = tuple(range(length) if frames is None else frames)
-    masks_BtKHW = hard_masks(rollout.decode_masks(frames))
-    arm, block, bowl = [], [], []
-    for masks_tKHW, grounding, instruction in zip(masks_BtKHW, groundings, instructions, strict=True):
-        arm.append(masks_tKHW[:, list(grounding.arm)].any(1))
-        block.append(masks_tKHW[:, list(grounding.find(instruction.block_thing))].any(1))
-        bowl.append(masks_tKHW[:, list(grounding.find(instruction.bowl_thing))].any(1))
-    return measure(torch.stack(arm), torch.stack(block), torch.stack(bowl), frames)
+    num_slots = rollout.slots.shape[2]
+    winner_BtHW = rollout.decode_masks(frames).argmax(2).cpu()  # which slot each pixel belongs to
 
+    def union(slots_of_B: Sequence[Sequence[int]]) -> Tensor:
+        member_BK = torch.zeros(batch, num_slots, dtype=torch.bool)
+        for b, slots in enumerate(slots_of_B):
+            member_BK[b, list(slots)] = True
+        return member_BK.gather(1, winner_BtHW.flatten(1)).view_as(winner_BtHW)
 
-def _one_each(values, kind, batch: int, name: str):
-    values = [values] * batch if isinstance(values, kind) else list(values)
-    if len(values) != batch:
-        raise ValueError(f"expected one or {batch} {name}, got {len(values)}")
-    return values
+    both = list(zip(each_grounding, each_instruction, strict=True))
+    return measure(
+        union([grounding.arm for grounding in each_grounding]),
+        union([grounding.find(instruction.block_thing) for grounding, instruction in both]),
+        union([grounding.find(instruction.bowl_thing) for grounding, instruction in both]),
+        frames,
+    )
 
 
 @dataclass(frozen=True)
 class Judge:
     """Says of each rollout of a trace whether the instruction was carried out.
 
-    The criterion of the paper's controllability study (section 4.4): the arm stays at the named block for some
-    frames in a row, and the block ends in the named bowl. Look at every frame for the criterion as calibrated.
+    The criterion of the paper's controllability study (section 4.4): the arm stays at the named block for
+    some frames in a row, and the block ends in the named bowl. Look at every frame for the criterion as
+    calibrated.
     """
 
     thresholds: Thresholds = THRESHOLDS
@@ -211,7 +236,9 @@ class WeightedSum:
 
     def __post_init__(self) -> None:
         if len(self.scores) != len(self.weights) or sum(self.weights) <= 0:
-            raise ValueError(f"{len(self.scores)} scores need as many weights with a positive sum: {self.weights}")
+            raise ValueError(
+                f"{len(self.scores)} scores need as many weights with a positive sum: {self.weights}"
+            )
 
     def __call__(self, trace: Trace) -> Tensor:
         parts = [weight * score(trace) for score, weight in zip(self.scores, self.weights, strict=True)]

@@ -10,10 +10,11 @@ class Thresholds:
     """Thresholds of the success criterion, for 64x64 pictures of the `close` camera.
 
     Attributes:
-        arm_block_px: the arm holds the block while the smallest distance between pixels of their masks is at most
-            this, in pixels between pixel centres (1 = neighbours).
+        arm_block_px: the arm holds the block while the smallest distance between pixels of their masks is at
+            most this, in pixels between pixel centres (1 = neighbours).
         hold_frames: for how many consecutive frames it must hold it.
-        block_bowl_px: the block lies in the bowl while their masks' centroids are at most this apart, in pixels.
+        block_bowl_px: the block lies in the bowl while their masks' centroids are at most this apart, in
+            pixels.
         settle_frames: how many last frames of the rollout it must lie there.
     """
 
