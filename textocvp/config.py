@@ -28,6 +28,9 @@ class ParserConfig:
         corrector: `slot_attention` (published) or `placed` (invariant slot attention with explicit colour, place
             and size; needs `layout.explicit`).
         transition_heads, transition_hidden: the transformer block between frames.
+        glimpse_size, glimpse_extent: cells of the canonical picture in which the `placed` corrector reads a slot, and
+            how many standard deviations it reaches to each side.
+        hidden: width of the `placed` corrector's fully connected layers.
     """
 
     image_size: int = 64
@@ -41,6 +44,9 @@ class ParserConfig:
     corrector: Literal["slot_attention", "placed"] = "placed"
     transition_heads: int = 4
     transition_hidden: int = 128
+    glimpse_size: int = 24
+    glimpse_extent: float = 2.6
+    hidden: int = 256
 
 
 @dataclass(frozen=True)
@@ -50,15 +56,17 @@ class RendererConfig:
     Attributes:
         kind: `broadcast` (spatial broadcast decoder, published) or `glimpse` (a small canonical picture a slot,
             placed at the slot's position and scale over a background canvas; needs `layout.explicit`).
-        channels: width of the decoder's convolutions.
-        glimpse_size: side of the canonical picture in pixels (`glimpse` only).
+        channels: width of the decoder's convolutions (`broadcast` only).
+        hidden: width of the decoder's fully connected layers (`glimpse` only).
+        glimpse_size: side of the canonical picture in cells (`glimpse` only).
         glimpse_extent: how many standard deviations the glimpse reaches to each side (`glimpse` only).
     """
 
     kind: Literal["broadcast", "glimpse"] = "glimpse"
     channels: int = 32
-    glimpse_size: int = 16
-    glimpse_extent: float = 3.0
+    hidden: int = 256
+    glimpse_size: int = 24
+    glimpse_extent: float = 2.6
 
 
 @dataclass(frozen=True)

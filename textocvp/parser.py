@@ -23,10 +23,13 @@ class Parsed:
     Attributes:
         slots_BTKD: the corrected slots of every frame.
         attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
+        expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None for a
+            parser whose slots have no place that could be expected.
     """
 
     slots_BTKD: Tensor
     attention_BTKHW: Tensor
+    expected_BTKD: Tensor | None = None
 
 
 class SceneParser(nn.Module):

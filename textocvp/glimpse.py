@@ -1,0 +1,121 @@
+"""Reading a slot's pixels into a small canonical picture, and drawing that picture back where the slot is.
+
+A slot that knows its place and size can be described in its own coordinates: the same block looks the same wherever
+it stands. Reading and drawing are axis-aligned, so each is two small matrix products (the separable attention of
+DRAW, Gregor et al. 2015) and differentiable in place and size. The explicit place follows Invariant Slot Attention
+(Biza et al. 2023).
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from textocvp.config import RendererConfig
+from textocvp.renderer import Rendered, Renderer
+from textocvp.slots import SlotLayout, SlotState
+
+BACKGROUND = 2.0
+"""Value of a slot's presence that marks it as the canvas behind everything (1 is a thing, 0 an unused slot)."""
+
+NOTHING = -12.0
+"""Alpha logit outside a glimpse and in unused slots; the background's is 0."""
+
+
+def _cell_centers(center: Tensor, scale: Tensor, cells: int, extent: float) -> tuple[Tensor, Tensor]:
+    """Positions (..., cells) of the canonical cells along one axis of the image (-1..1), and their spacing (..., 1)."""
+    steps = (torch.arange(cells, device=center.device, dtype=center.dtype) + 0.5) / cells * 2 - 1
+    reach = scale[..., None] * extent
+    return center[..., None] + reach * steps, 2 * reach / cells
+
+
+def reading_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
+    """(..., cells, pixels): each canonical cell as a weighted mean of the pixels under it, along one axis.
+
+    Args:
+        center, scale: (...) place and standard deviation of the slot along this axis, in -1..1.
+    """
+    where, spacing = _cell_centers(center, scale, cells, extent)
+    pixel = (torch.arange(pixels, device=center.device, dtype=center.dtype) + 0.5) / pixels * 2 - 1
+    width = spacing.clamp_min(2 / pixels)[..., None]  # never narrower than a pixel: interpolate, do not skip
+    hat = (1 - (where[..., None] - pixel).abs() / width).clamp_min(0)
+    return hat / hat.sum(-1, keepdim=True).clamp_min(0.5)  # cells outside the image fade to 0
+
+
+def drawing_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
+    """(..., pixels, cells): each pixel as a linear interpolation of the canonical cells around it, along one axis."""
+    where, spacing = _cell_centers(center, scale, cells, extent)
+    pixel = (torch.arange(pixels, device=center.device, dtype=center.dtype) + 0.5) / pixels * 2 - 1
+    return (1 - (pixel[:, None] - where[..., None, :]).abs() / spacing[..., None]).clamp_min(0)
+
+
+def read(images: Tensor, position: Tensor, scale: Tensor, cells: int, extent: float) -> Tensor:
+    """Canonical pictures (B, K, C, cells, cells) of images (B, K, C, H, W) around position and scale (B, K, 2)."""
+    rows = reading_weights(position[..., 1], scale[..., 1], images.shape[-2], cells, extent)
+    columns = reading_weights(position[..., 0], scale[..., 0], images.shape[-1], cells, extent)
+    return rows[:, :, None] @ images @ columns[:, :, None].transpose(-1, -2)
+
+
+def draw(pictures: Tensor, position: Tensor, scale: Tensor, height: int, width: int, extent: float) -> Tensor:
+    """Images (B, K, C, H, W) with the canonical pictures (B, K, C, cells, cells) at position and scale (B, K, 2)."""
+    cells = pictures.shape[-1]
+    rows = drawing_weights(position[..., 1], scale[..., 1], height, cells, extent)
+    columns = drawing_weights(position[..., 0], scale[..., 0], width, cells, extent)
+    return rows[:, :, None] @ pictures @ columns[:, :, None].transpose(-1, -2)
+
+
+class GlimpseRenderer(Renderer):
+    """Draws every slot as a canonical picture in its own colour, at its own place and size, over one canvas.
+
+    The content becomes `glimpse_size`^2 cells of (alpha logit, shading). An object's colour is the slot's explicit
+    colour times its shading, so that a colour never seen in training is drawn as well as any other. The canvas, the
+    picture behind everything for the fixed camera, is the background slot's colour times a learned shading.
+    """
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        if not layout.explicit:
+            raise ValueError("renderer.kind 'glimpse' needs parser.layout.explicit: it draws a slot at its own place")
+        self.layout = layout
+        self.size = image_size
+        self.cells = config.glimpse_size
+        self.extent = config.glimpse_extent
+        self.decoder = nn.Sequential(
+            nn.Linear(layout.content, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, 2 * self.cells**2),
+        )
+        self.canvas = nn.Parameter(torch.zeros(self.size, self.size))
+
+    def forward(self, slots: Tensor) -> Rendered:
+        """Frames, masks and the slots' own pictures of slots (B, K, D); see `Rendered`."""
+        state = SlotState.split(slots, self.layout)
+        logits_BKHW, shading_BKHW = self._pictures(state).unbind(2)
+        masks_BKHW = self._compete(logits_BKHW, state)
+        is_background = (state.presence > 1.5)[..., None]  # (B, K, 1, 1)
+        shading_BKHW = torch.where(is_background, self.canvas, shading_BKHW)
+        rgb_BK3HW = (state.color[..., None, None] + 1) / 2 * (1 + shading_BKHW[:, :, None]) * 2 - 1
+        frames_B3HW = (masks_BKHW[:, :, None] * rgb_BK3HW).sum(1)
+        return Rendered(frames_B3HW, masks_BKHW, rgb_BK3HW)
+
+    def masks(self, slots: Tensor) -> Tensor:
+        """Masks (B, K, H, W) alone, at half the cost."""
+        state = SlotState.split(slots, self.layout)
+        return self._compete(self._pictures(state, logits_only=True)[:, :, 0], state)
+
+    def _pictures(self, state: SlotState, logits_only: bool = False) -> Tensor:
+        B, K, _ = state.content.shape
+        channels = 1 if logits_only else 2
+        cells = self.decoder(state.content).view(B, K, 2, self.cells, self.cells)[:, :, :channels]
+        # Drawn relative to NOTHING, so that the zeros outside of a glimpse mean "nothing here".
+        offset = torch.tensor([NOTHING, 0.0], device=cells.device, dtype=cells.dtype)[:channels, None, None]
+        return draw(cells - offset, state.position, state.scale, self.size, self.size, self.extent) + offset
+
+    def _compete(self, logits_BKHW: Tensor, state: SlotState) -> Tensor:
+        presence = state.presence[..., None]  # (B, K, 1, 1)
+        logits_BKHW = torch.where(presence > 0.5, logits_BKHW, torch.full_like(logits_BKHW, NOTHING))
+        logits_BKHW = torch.where(presence > 1.5, torch.zeros_like(logits_BKHW), logits_BKHW)
+        return F.softmax(logits_BKHW, dim=1)

@@ -1,0 +1,65 @@
+"""What the parser is trained for (stage 1). The predictor's losses live beside its loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from textocvp.renderer import Rendered
+from textocvp.slots import SlotState
+
+
+@dataclass
+class ParserLoss:
+    """The terms of stage 1, each a scalar.
+
+    Attributes:
+        image: mean squared error of the reconstruction, things weighted above the canvas.
+        mask: cross-entropy of the drawn masks against the parser's attention.
+        place: squared error of the places that the transition expected against those the corrector found.
+    """
+
+    image: Tensor
+    mask: Tensor
+    place: Tensor
+
+    def total(self, mask_weight: float, place_weight: float) -> Tensor:
+        """The weighted sum that is minimised."""
+        return self.image + mask_weight * self.mask + place_weight * self.place
+
+
+def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
+    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things.
+
+    A pixel shows a thing where it differs from its image's median colour by more than `threshold`: no labels needed.
+    """
+    median = target.flatten(-2).median(-1).values[..., None, None]
+    thing = (target - median).abs().amax(-3, keepdim=True) > threshold
+    return 1 + thing_weight * thing.to(target.dtype)
+
+
+def image_loss(rendered: Rendered, target: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean squared error of the composed frames against frames (B, 3, H, W)."""
+    return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * weights.sum())
+
+
+def mask_loss(rendered: Rendered, attention_BKHW: Tensor, weights: Tensor) -> Tensor:
+    """Weighted cross-entropy of the drawn masks against the attention's winners; no gradient enters the attention.
+
+    The renderer sees only the slots, the attention also the pixels: agreeing with it teaches the renderer where a
+    slot ends long before the image loss alone would, and without labels (self-distillation, as in SPOT, 2024).
+    """
+    log_masks = rendered.masks_BKHW.clamp_min(1e-6).log()
+    per_pixel = F.nll_loss(log_masks, attention_BKHW.argmax(1), reduction="none")
+    return (weights[:, 0] * per_pixel).sum() / weights.sum()
+
+
+def place_loss(expected: SlotState, found: SlotState) -> Tensor:
+    """Mean squared error of expected places and log-sizes, over the things; no gradient enters `found`."""
+    wanted = torch.cat([found.position, found.scale.log()], dim=-1).detach()
+    error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
+    things = (found.presence[..., 0] > 0.5) & (found.presence[..., 0] < 1.5)
+    return torch.where(things, error, torch.zeros_like(error)).sum() / things.sum().clamp_min(1)

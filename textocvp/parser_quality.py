@@ -1,0 +1,79 @@
+"""How well a parser finds the things of held-out episodes, measured against the simulator's segmentation.
+
+The segmentation is used for measuring only; nothing here is ever trained on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+
+from textocvp.episodes import EpisodeFile
+from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
+from textocvp.model import TextOCVP
+
+
+@dataclass(frozen=True)
+class ParserQuality:
+    """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval.
+
+    Attributes:
+        object_miou: IoU of drawn masks with blocks and bowls, Hungarian matching a frame.
+        object_found: share of blocks and bowls with an IoU above one half.
+        followed: share of the first frame's things whose slot keeps them through the whole episode.
+        foreground_ari: adjusted Rand index without the background's pixels, the arm included.
+        psnr: of the redrawn frames, dB.
+    """
+
+    object_miou: Interval
+    object_found: Interval
+    followed: Interval
+    foreground_ari: Interval
+    psnr: Interval
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {getattr(self, name)}" for name in self.__dataclass_fields__)
+
+    def figures(self) -> dict[str, float]:
+        """The values alone, named for a log."""
+        return {f"quality/{name}": getattr(self, name).value for name in self.__dataclass_fields__}
+
+    def to_json(self) -> str:
+        """Values, intervals and numbers of episodes."""
+        return json.dumps(asdict(self), indent=2) + "\n"
+
+
+@torch.no_grad()
+def measure_parser(
+    model: TextOCVP, episodes: EpisodeFile, chosen: Iterable[int], *, frame_step: int = 3
+) -> ParserQuality:
+    """Parse whole episodes and compare the drawn masks with the simulator's.
+
+    Args:
+        model: its parser and renderer are measured.
+        episodes: held-out episodes.
+        chosen: their numbers.
+        frame_step: IoU, ARI and PSNR are taken at every `frame_step`-th frame; following always at every frame.
+    """
+    ious, found, follows, aris, psnrs = [], [], [], [], []
+    for index in chosen:
+        episode = episodes.episode(index)
+        frames = torch.from_numpy(episode.frames).permute(0, 3, 1, 2).float().to(model.device) / 127.5 - 1
+        slots = model.parser(frames[None]).slots_BTKD[0]
+        rendered = model.renderer(slots)
+        labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
+        # The arm (1) is not an object: as background it matches nothing.
+        objects = np.where(episode.segmentation == 1, 0, episode.segmentation)
+        times = range(0, len(labels), frame_step)
+        matches = np.concatenate([object_ious(labels[t], objects[t]).ious for t in times])
+        ious.append(matches.mean())
+        found.append((matches > 0.5).mean())
+        follows.append(followed(labels, objects).mean())
+        aris.append(np.mean([foreground_ari(labels[t], episode.segmentation[t]) for t in times]))
+        drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
+        psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())
+    return ParserQuality(*(bootstrap_interval(values) for values in (ious, found, follows, aris, psnrs)))
