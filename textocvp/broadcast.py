@@ -1,7 +1,7 @@
 """The published renderer: a spatial broadcast decoder (Watters et al. 2019; TextOCVP-SAVi).
 
-Every slot is copied to every pixel, told where that pixel is, and decoded by four convolutions to a colour and an
-alpha; the alphas of all slots become masks by a softmax over the slots.
+Every slot is copied to every pixel, told where that pixel is, and decoded by four convolutions to a colour
+and an alpha; the alphas of all slots become masks by a softmax over the slots.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from textocvp.config import ParserConfig, RendererConfig
+from textocvp.config import RendererConfig
 from textocvp.renderer import Rendered, Renderer
 from textocvp.savi import PositionCode
+from textocvp.slots import SlotLayout
 
 
 class BroadcastRenderer(Renderer):
@@ -20,14 +21,15 @@ class BroadcastRenderer(Renderer):
     Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
 
     Args:
-        parser: gives the slots' width and the frame's size.
         config: `channels`.
+        layout: gives the slots' width.
+        image_size: side of the frames in pixels.
     """
 
-    def __init__(self, parser: ParserConfig, config: RendererConfig) -> None:
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
         super().__init__()
-        self.image_size = parser.image_size
-        slot_dim, channels = parser.layout.dim, config.channels
+        self.image_size = image_size
+        slot_dim, channels = layout.dim, config.channels
         self.position = PositionCode(slot_dim)
         self.convolutions = nn.Sequential(
             nn.Conv2d(slot_dim, channels, 5, padding=2),

@@ -1,4 +1,5 @@
-"""Pictures of rollouts: frames above masks, one stable colour a slot, enlarged so that a person can see something."""
+"""Pictures of rollouts: frames above masks, one stable colour a slot, enlarged so that a person can see
+something."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def slot_palette(num_slots: int) -> np.ndarray:
 
 
 def color_masks(masks: np.ndarray) -> np.ndarray:
-    """Masks (..., K, H, W) as pictures (..., H, W, 3) uint8: each pixel the mask-weighted mix of the slots' colours."""
+    """Masks (..., K, H, W) as pictures (..., H, W, 3) uint8: each pixel the mask-weighted mix of the slots'
+    colours."""
     mixed = np.einsum("...khw,kc->...hwc", masks, slot_palette(masks.shape[-3]))
     return (mixed.clip(0, 1) * 255).round().astype(np.uint8)
 

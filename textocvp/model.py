@@ -1,8 +1,8 @@
 """TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
 
-A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the model, and no
-other). Loading is strict: a checkpoint that does not fit is an error that names the field or the tensor. Nothing is
-ever unpickled.
+A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the
+model, and no other). Loading is strict: a checkpoint that does not fit is an error that names the field or
+the tensor. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class TextOCVP(
         self.parser = build_parser(config.parser)
         self.text = TextEncoder(config.text)
         self.predictor = Predictor(config.predictor, config.parser.layout, config.text.dim)
-        self.renderer = build_renderer(config.parser, config.renderer)
+        self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
 
     @property
     def device(self) -> torch.device:
@@ -65,7 +65,9 @@ class TextOCVP(
     def _save_pretrained(self, save_directory: Path) -> None:
         """Called by `save_pretrained(folder)`, which also writes a model card unless the folder has one."""
         # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
-        tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in self.state_dict().items()}
+        tensors = {
+            name: tensor.detach().cpu().contiguous().clone() for name, tensor in self.state_dict().items()
+        }
         save_file(tensors, save_directory / WEIGHTS_FILE, metadata={"format": "pt"})
         text = json.dumps(self.config.to_dict(), indent=2) + "\n"
         (save_directory / CONFIG_FILE).write_text(text, encoding="utf-8")
@@ -89,7 +91,8 @@ class TextOCVP(
             device: where to put the model.
 
         Raises:
-            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is named.
+            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is
+                named.
         """
         folder = Path(pretrained_model_name_or_path)
         if not folder.is_dir():
@@ -105,8 +108,8 @@ class TextOCVP(
             # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
             except Exception as error:
                 raise CheckpointError(
-                    f"{str(pretrained_model_name_or_path)!r} is no folder here, and fetching it from the Hugging Face "
-                    f"hub failed: {type(error).__name__}: {error}"
+                    f"{str(pretrained_model_name_or_path)!r} is no folder here, and fetching it from "
+                    f"the Hugging Face hub failed: {type(error).__name__}: {error}"
                 ) from error
             folder = Path(found)
         config = read_config(folder)
@@ -129,7 +132,8 @@ def read_config(folder: Path) -> ModelConfig:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise CheckpointError(
-            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and {WEIGHTS_FILE}"
+            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and "
+            f"{WEIGHTS_FILE}"
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
@@ -145,8 +149,8 @@ def load_weights(model: nn.Module, path: Path) -> None:
     """Copy every tensor of a safetensors file into the model.
 
     Raises:
-        CheckpointError: if the file is missing or damaged, or its tensors are not exactly the model's in name, shape
-            and kind of number.
+        CheckpointError: if the file is missing or damaged, or its tensors are not exactly the model's in
+            name, shape and kind of number.
     """
     try:
         found = load_file(path)

@@ -1,7 +1,8 @@
 """From frames to slots: the interface that every scene parser has, and the one place that picks one.
 
-A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition (between
-frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the subclass's business.
+A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition
+(between frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the
+subclass's business.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ class Parsed:
     Attributes:
         slots_BTKD: the corrected slots of every frame.
         attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
-        expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None for a
-            parser whose slots have no place that could be expected.
+        expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None
+            for a parser whose slots have no place that could be expected.
     """
 
     slots_BTKD: Tensor
@@ -54,7 +55,8 @@ class SceneParser(nn.Module):
         Args:
             frames_BT3HW: frames in -1..1, of the size the parser was built for.
             num_slots: how many slots to use, background included; the configured number by default.
-            generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by default.
+            generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by
+                default.
         """
         raise NotImplementedError
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from textocvp.config import ParserConfig, RendererConfig
+from textocvp.config import RendererConfig
+from textocvp.slots import SlotLayout
 
 
 @dataclass
@@ -38,19 +39,24 @@ class Renderer(nn.Module):
         return self(slots_BKD).masks_BKHW
 
 
-def build_renderer(parser: ParserConfig, config: RendererConfig) -> Renderer:
-    """The renderer that `config.kind` names, for the slots that the parser of `parser` makes.
+def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
+    """The renderer that `config.kind` names.
+
+    Args:
+        config: its kind and sizes.
+        layout: what the numbers of one slot mean.
+        image_size: side of the square frames it draws, in pixels.
 
     Raises:
-        ValueError: if there is no such kind, or it does not fit the parser's slot layout.
+        ValueError: if there is no such kind, or it does not fit the layout.
     """
     # Imported here because the renderers import this module for their base class.
     if config.kind == "broadcast":
         from textocvp.broadcast import BroadcastRenderer
 
-        return BroadcastRenderer(parser, config)
+        return BroadcastRenderer(config, layout, image_size)
     if config.kind == "glimpse":
         from textocvp.glimpse import GlimpseRenderer
 
-        return GlimpseRenderer(parser, config)
+        return GlimpseRenderer(config, layout, image_size)
     raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse")

@@ -1,7 +1,8 @@
-"""What the world model imagined, or parsed: slots, and whatever can be read off them, decoded only when asked for.
+"""What the world model imagined, or parsed: slots, and whatever can be read off them, decoded only when
+asked for.
 
-Decoding costs several times more than predicting. A planner that scores thirty instructions needs masks at a few
-frames and colours at none, so nothing is drawn before somebody looks at it, and nothing is drawn twice.
+Decoding costs several times more than predicting. A planner that scores thirty instructions needs masks at a
+few frames and colours at none, so nothing is drawn before somebody looks at it, and nothing is drawn twice.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from textocvp.drawing import save_film
 from textocvp.renderer import Renderer
 from textocvp.slots import SlotLayout, SlotState, pixel_grid
 
-#: How many pictures the renderer draws at once: large enough to keep two cores busy, small enough for the cache.
+#: How many pictures the renderer draws at once: large enough to keep two cores busy, small enough for the
+#: cache.
 CHUNK = 64
 
 
@@ -32,10 +34,11 @@ class _Decoded:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rollout:
-    """A batch of B sequences of T frames with K slots each. Frame 0 is what was observed; the others are imagined.
+    """A batch of B sequences of T frames with K slots each. Frame 0 is what was observed; the others are
+    imagined.
 
-    All tensors are float32 without gradient, on the model's device. Slots keep their number through time: slot 3 of
-    frame 20 is the thing that was slot 3 in frame 0.
+    All tensors are float32 without gradient, on the model's device. Slots keep their number through time:
+    slot 3 of frame 20 is the thing that was slot 3 in frame 0.
 
     Attributes:
         slots: (B, T, K, D).
@@ -59,7 +62,9 @@ class Rollout:
         said = ", ".join(repr(text) for text in self.texts[:2]) + (", ..." if len(self.texts) > 2 else "")
         what = f"imagined from {said}" if self.texts else "parsed from frames"
         H, W = self.image_size
-        drawn = f"masks decoded at {len(self._decoded.masks)}, frames at {len(self._decoded.frames)} of {T} times"
+        drawn = (
+            f"masks decoded at {len(self._decoded.masks)}, frames at {len(self._decoded.frames)} of {T} times"
+        )
         return f"Rollout(B={B} sequences, T={T} frames, K={K} slots of {D}, {H}x{W} pixels, {what}; {drawn})"
 
     def __len__(self) -> int:
@@ -175,8 +180,9 @@ class Rollout:
         return self.slots.new_tensor([W, H])
 
     def _shares(self) -> Tensor:
-        """Masks as weights that sum to 1 over the pixels. Only pixels that the slot wins count, if it wins any:
-        a soft mask has a faint tail over the whole picture, which would draw every centre towards the middle."""
+        """Masks as weights that sum to 1 over the pixels. Only pixels that the slot wins count, if it wins
+        any: a soft mask has a faint tail over the whole picture, which would draw every centre towards the
+        middle."""
         masks = self.masks
         won = torch.zeros_like(masks).scatter_(2, masks.argmax(dim=2, keepdim=True), 1.0) * masks
         some = won.flatten(3).sum(dim=-1)[..., None, None] > 0
@@ -233,9 +239,10 @@ class Rollout:
         """Draw the rollout into a file: each imagined frame above its masks, one stable colour a slot.
 
         Args:
-            path: the suffix decides: `.gif` and `.mp4` play through time, `.png` is a strip from left to right.
-            beside: real frames (T', H, W, 3) uint8 or (B, T', H, W, 3) to show above the imagined ones; if they end
-                earlier than the rollout, the last one stays.
+            path: the suffix decides: `.gif` and `.mp4` play through time, `.png` is a strip from left to
+                right.
+            beside: real frames (T', H, W, 3) uint8 or (B, T', H, W, 3) to show above the imagined ones; if
+                they end earlier than the rollout, the last one stays.
             fps: frames a second, for `.gif` and `.mp4`.
 
         Returns:
@@ -245,5 +252,10 @@ class Rollout:
             ValueError: if the suffix is another one, or `beside` has another shape.
         """
         return save_film(
-            Path(path), self.frames.cpu().numpy(), self.masks.cpu().numpy(), self.texts, beside=beside, fps=fps
+            Path(path),
+            self.frames.cpu().numpy(),
+            self.masks.cpu().numpy(),
+            self.texts,
+            beside=beside,
+            fps=fps,
         )

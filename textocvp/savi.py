@@ -1,7 +1,7 @@
-"""The published scene parser: slot attention for video (SAVi; TextOCVP section 3.1 and appendix, TextOCVP-SAVi).
+"""The published scene parser: slot attention for video (SAVi; TextOCVP section 3.1 and appendix).
 
-    frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transition -> next frame's first guess
-                                             ^ first frame: GaussianInitializer or clusters
+frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transition -> next frame's guess
+                                     ^ first frame: GaussianInitializer or clusters
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class PositionCode(nn.Module):
 
 
 class ConvEncoder(nn.Module):
-    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code, location-wise MLP.
+    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code,
+    location-wise MLP.
 
     Args:
         channels: width of the convolutions (32 in the paper).
@@ -62,7 +63,8 @@ class ConvEncoder(nn.Module):
 
 
 class GaussianInitializer(nn.Module):
-    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test time."""
+    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test
+    time."""
 
     def __init__(self, slot_dim: int) -> None:
         super().__init__()
@@ -72,7 +74,12 @@ class GaussianInitializer(nn.Module):
     def forward(self, batch: int, num_slots: int, generator: torch.Generator | None = None) -> Tensor:
         """(batch, num_slots, D) slots."""
         noise_BKD = torch.randn(
-            batch, num_slots, self.mean.shape[0], generator=generator, device=self.mean.device, dtype=self.mean.dtype
+            batch,
+            num_slots,
+            self.mean.shape[0],
+            generator=generator,
+            device=self.mean.device,
+            dtype=self.mean.dtype,
         )
         return self.mean + self.log_deviation.exp() * noise_BKD
 
@@ -80,7 +87,8 @@ class GaussianInitializer(nn.Module):
 class ClusterSlots(nn.Module):
     """First slots from clusters of colour and place: the mean feature of each cluster, through a small MLP.
 
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
+    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other:
+        in this
     family a slot has no presence that could switch it off.
     """
 
@@ -95,7 +103,9 @@ class ClusterSlots(nn.Module):
     def forward(self, frames_B3HW: Tensor, features_BDhw: Tensor, num_slots: int) -> Tensor:
         """(B, num_slots, D) slots."""
         found = self.clusters(frames_B3HW, num_slots)
-        shares_BKL = F.adaptive_avg_pool2d(found.masks, features_BDhw.shape[-2:]).flatten(2)
+        shares_BKL = F.adaptive_avg_pool2d(
+            found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
+        ).flatten(2)
         shares_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
         slots_BKD = self.mlp(shares_BKL @ features_BDhw.flatten(2).transpose(1, 2))
         return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty)
@@ -104,8 +114,8 @@ class ClusterSlots(nn.Module):
 class SlotAttention(nn.Module):
     """The corrector: slots compete for locations, then each is updated with the mean of what it won.
 
-    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the locations; the update
-    is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
+    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the
+    locations; the update is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
     """
 
     def __init__(self, slot_dim: int, hidden: int) -> None:
@@ -120,7 +130,8 @@ class SlotAttention(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
 
     def forward(self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the slots.
+        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
+        slots.
 
         Raises:
             ValueError: if `iterations` is below 1.
@@ -145,12 +156,12 @@ class SlotAttention(nn.Module):
 class SaviParser(SceneParser):
     """Slot attention for video over clips.
 
-    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ unless the
-    same generator state is given.
+    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
+    unless the same generator state is given.
 
     Raises:
-        ValueError: if the layout has explicit channels (this corrector gives content only), or the initializer is
-            unknown.
+        ValueError: if the layout has explicit channels (this corrector gives content only), or the
+            initializer is unknown.
     """
 
     def __init__(self, config: ParserConfig) -> None:
@@ -167,7 +178,12 @@ class SaviParser(SceneParser):
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
         self.transition = nn.TransformerEncoderLayer(
-            dim, config.transition_heads, config.transition_hidden, dropout=0.0, batch_first=True, norm_first=True
+            dim,
+            config.transition_heads,
+            config.transition_hidden,
+            dropout=0.0,
+            batch_first=True,
+            norm_first=True,
         )
 
     def forward(

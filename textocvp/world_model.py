@@ -1,4 +1,5 @@
-"""The world model as users meet it: load a checkpoint, give it an observation and a sentence, get a `Rollout`."""
+"""The world model as users meet it: load a checkpoint, give it an observation and a sentence, get a
+`Rollout`."""
 
 from __future__ import annotations
 
@@ -60,12 +61,13 @@ class WorldModel:
         """Load a checkpoint.
 
         Args:
-            name_or_folder_or_hub_id: a bundled name (`bundled_checkpoints()`), else a folder, else the id `owner/name`
-                of a repository on the Hugging Face hub.
+            name_or_folder_or_hub_id: a bundled name (`bundled_checkpoints()`), else a folder, else the id
+                `owner/name` of a repository on the Hugging Face hub.
             device: where the model computes.
 
         Raises:
-            CheckpointError: if there is no such checkpoint (the message lists the bundled ones), or it is damaged.
+            CheckpointError: if there is no such checkpoint (the message lists the bundled ones), or it is
+                damaged.
         """
         name = str(name_or_folder_or_hub_id)
         if name in bundled_checkpoints():
@@ -75,8 +77,8 @@ class WorldModel:
             return cls._from_folder(Path(name), name, device)
         bundled = ", ".join(bundled_checkpoints()) or "none"
         allowed = (
-            f"Bundled checkpoints: {bundled}. Else give a folder that contains {CONFIG_FILE} and {WEIGHTS_FILE}, or the "
-            "id owner/name of a repository on the Hugging Face hub that does."
+            f"Bundled checkpoints: {bundled}. Else give a folder that contains {CONFIG_FILE} and "
+            f"{WEIGHTS_FILE}, or the id owner/name of a repository on the Hugging Face hub that does."
         )
         if name.count("/") != 1 or name.startswith((".", "/", "~")):
             raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
@@ -94,10 +96,15 @@ class WorldModel:
     def __repr__(self) -> str:
         config = self.model.config
         million = sum(p.numel() for p in self.model.parameters()) / 1e6
-        side = config.parser.image_size
+        H, W = self.image_size
+        ahead = (
+            f"up to {self.longest_horizon} frames ahead"
+            if self.longest_horizon
+            else "any number of frames ahead"
+        )
         return (
-            f"WorldModel({self.checkpoint.name!r}, {million:.1f} M parameters, {side}x{side} frames, "
-            f"{config.parser.num_slots} slots, up to {self.longest_horizon} frames ahead, on {self.model.device})"
+            f"WorldModel({self.checkpoint.name!r}, {million:.1f} M parameters, {H}x{W} frames, "
+            f"{config.parser.num_slots} slots, {ahead}, on {self.model.device})"
         )
 
     @property
@@ -108,7 +115,8 @@ class WorldModel:
 
     @property
     def longest_horizon(self) -> int | None:
-        """How many frames it can imagine at once; None for as many as you like (the published moving window)."""
+        """How many frames it can imagine at once; None for as many as you like (the published moving
+        window)."""
         predictor = self.model.config.predictor
         return predictor.window if predictor.attention == "causal" else None
 
@@ -125,25 +133,26 @@ class WorldModel:
     ) -> Rollout:
         """Imagine the next `horizon` frames.
 
-        One scene and n texts give n sequences over one parsed scene; n scenes and n texts go together pairwise; n
-        scenes and one text all get that text.
+        One scene and n texts give n sequences over one parsed scene; n scenes and n texts go together
+        pairwise; n scenes and one text all get that text.
 
         Args:
-            obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images
-                (B, H, W, 3), uint8; or a rollout, to go on from its last slots.
+            obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3)
+                or images (B, H, W, 3), uint8; or a rollout, to go on from its last slots.
             text: what is to be done.
             horizon: how many frames to imagine after the one that is seen.
             seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
             attention: also keep the weights from slots to words.
-            use_cache: reuse the keys and values of past frames; without it they are computed again at every step
-                (slower, the same up to rounding; for checks).
+            use_cache: reuse the keys and values of past frames; without it they are computed again at every
+                step (slower, the same up to rounding; for checks).
 
         Returns:
             a rollout of `horizon + 1` frames, the first of which is the parsed observation.
 
         Raises:
             TypeError: if the observation is not uint8 or none of the above.
-            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says what is.
+            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says
+                what is.
 
         A word that the text encoder has never met is a `UserWarning` that names the word.
         """
@@ -153,15 +162,15 @@ class WorldModel:
             raise ValueError(f"horizon must be a whole number of at least 1 frame, not {horizon!r}")
         if longest is not None and horizon > longest:
             raise ValueError(
-                f"horizon {horizon} is longer than this model was trained for: at most {longest}. To see further, go on "
-                "from where a rollout ended: rollout(previous_rollout, text)"
+                f"horizon {horizon} is longer than this model was trained for: at most {longest}. To see "
+                "further, go on from where a rollout ended: rollout(previous_rollout, text)"
             )
         slots_BKD = self._first_slots(obs, seed)
         scenes, sentences = slots_BKD.shape[0], len(texts)
         if scenes != sentences and scenes != 1 and sentences != 1:
             raise ValueError(
-                f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as many of "
-                "each"
+                f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as "
+                "many of each"
             )
         B = max(scenes, sentences)
         texts = texts * B if sentences == 1 else texts
@@ -199,19 +208,23 @@ class WorldModel:
         if isinstance(obs, Rollout):
             if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
                 raise ValueError(
-                    f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} pixels, "
-                    f"this model's are {self.model.parser.layout} at {self.image_size}"
+                    f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} "
+                    f"pixels, this model's are {self.model.parser.layout} at {self.image_size}"
                 )
             return obs.slots[:, -1].to(self.model.device)
         if isinstance(obs, Mapping):
             if "rgb" not in obs:
-                raise ValueError(f"the observation has no 'rgb'; it has {', '.join(map(repr, obs)) or 'nothing'}")
+                raise ValueError(
+                    f"the observation has no 'rgb'; it has {', '.join(map(repr, obs)) or 'nothing'}"
+                )
             obs = obs["rgb"]
         images = np.asarray(obs)
         if images.ndim == 3:
             images = images[None]
         if images.ndim != 4:
-            raise ValueError(f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}")
+            raise ValueError(
+                f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}"
+            )
         frames_B3HW = self._checked_images(images, "the observation")
         return self.model.parser(frames_B3HW[:, None], generator=self._generator(seed)).slots_BTKD[:, 0]
 
@@ -220,18 +233,26 @@ class WorldModel:
         H, W = self.image_size
         if images.dtype != np.uint8:
             hint = ""
-            if np.issubdtype(images.dtype, np.floating) and images.size and 0 <= images.min() <= images.max() <= 1:
+            if (
+                np.issubdtype(images.dtype, np.floating)
+                and images.size
+                and 0 <= images.min() <= images.max() <= 1
+            ):
                 hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)"
             raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
         if images.shape[-1] != 3 or images.shape[0] == 0:
-            raise ValueError(f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}")
+            raise ValueError(
+                f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}"
+            )
         if images.shape[1:3] != (H, W):
             raise ValueError(
-                f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} and no other "
-                "size: render or resize to that"
+                f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} "
+                "and no other size: render or resize to that"
             )
         if images.max() == 1:
-            raise ValueError(f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255")
+            raise ValueError(
+                f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255"
+            )
         frames_NHW3 = torch.from_numpy(np.ascontiguousarray(images)).to(self.model.device)
         return frames_NHW3.permute(0, 3, 1, 2).float() / 127.5 - 1
 
@@ -243,14 +264,18 @@ class WorldModel:
             if not isinstance(sentence, str):
                 raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
             if not sentence.strip():
-                raise ValueError('an empty text; say what is to be done, for example "put the red block in the blue bowl"')
-        unknown = list(dict.fromkeys(word for sentence in texts for word in self.model.text.unknown_words(sentence)))
+                raise ValueError(
+                    "an empty text; say what is to be done: 'put the red block in the blue bowl'"
+                )
+        unknown = list(
+            dict.fromkeys(word for sentence in texts for word in self.model.text.unknown_words(sentence))
+        )
         if unknown:
             words = ", ".join(map(repr, unknown))
             warnings.warn(
-                f"the text encoder has never met {words}; what is imagined may ignore {'them' if len(unknown) > 1 else 'it'}",
+                f"the text encoder has never met {words}: what is imagined may be as if it were not there",
                 UserWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         return texts
 
