@@ -97,6 +97,11 @@ def run_episode(
     Raises:
         ValueError: if the environment is not in `primitive` control.
     """
+    if env.action_space.shape != (4,):
+        raise ValueError(
+            "the loop acts by pick-and-place: make the environment with control='primitive' and without "
+            f"place_yaw, so that an action has 4 numbers; its action space is {env.action_space}"
+        )
     observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
     rgb = observation["rgb"]
     goal = Goal.parse(info["instruction"]) if goal is None else goal

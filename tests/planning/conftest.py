@@ -1,0 +1,38 @@
+"""One small scene, seen by the `close` camera, for all planning tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from envs.camera import PRESETS, Camera
+from planning import PinholeCamera
+from tests.planning.oracle import OracleWorldModel
+
+
+def thing(kind: str, color: str, x: float, y: float) -> dict[str, Any]:
+    """An entry of `info["objects"]`: a standing block, or a bowl on its foot."""
+    return {"kind": kind, "color": color, "position": (x, y, 0.029 if kind == "block" else 0.0)}
+
+
+@pytest.fixture
+def camera() -> PinholeCamera:
+    close = Camera(PRESETS["close"], 64)
+    return PinholeCamera.from_info({"intrinsics": close.intrinsics, "extrinsics": close.extrinsics})
+
+
+@pytest.fixture
+def objects() -> list[dict[str, Any]]:
+    return [
+        thing("block", "red", 0.45, -0.12),
+        thing("block", "green", 0.62, 0.10),
+        thing("bowl", "blue", 0.60, -0.10),
+        thing("bowl", "gray", 0.42, 0.08),
+        thing("bowl", "white", 0.66, 0.0),
+    ]
+
+
+@pytest.fixture
+def oracle(objects: list[dict[str, Any]], camera: PinholeCamera) -> OracleWorldModel:
+    return OracleWorldModel(lambda: objects, camera)

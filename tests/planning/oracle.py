@@ -1,0 +1,140 @@
+"""A test double for the world model: it imagines by geometry, from the simulator's own object poses.
+
+It cheats on purpose (it is given the true scene), so that planners, controller and loop can be tested without a
+trained checkpoint. Its rollouts are real `Rollout` objects whose masks are drawn from slots by `ShapeRenderer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from planning import Instruction, PinholeCamera
+from planning.grounding import COLORS, ROBOT_COLOR, TABLE_COLOR
+from textocvp.renderer import Rendered, Renderer
+from textocvp.rollout import Rollout
+from textocvp.slots import SlotLayout
+
+LAYOUT = SlotLayout(content=4)  # x, y, z in metres, and the layer that it is drawn in
+BACKGROUND, BOWL, BLOCK, ARM = 0.0, 1.0, 2.0, 3.0
+BLOCK_SIZE, BOWL_RADIUS, BOWL_HEIGHT = 0.058, 0.069, 0.046
+HOME = np.array([0.34, 0.0, 0.13])
+NAMES = list(COLORS)
+
+
+class ShapeRenderer(Renderer):
+    """Draws blocks as boxes, bowls as ellipses and the arm as a thick line from the top edge to its tip."""
+
+    def __init__(self, size: int = 64) -> None:
+        super().__init__()
+        self.size = size
+
+    def forward(self, slots_BKD: Tensor) -> Rendered:
+        masks_BKHW = self.masks(slots_BKD)
+        colors_BK3 = slots_BKD[..., 4:7]
+        frames_B3HW = torch.einsum("bkhw,bkc->bchw", masks_BKHW, colors_BK3)
+        return Rendered(frames_B3HW, masks_BKHW, colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size))
+
+    def masks(self, slots_BKD: Tensor) -> Tensor:
+        layer_BK11 = slots_BKD[..., 3, None, None]
+        center_BK2 = (slots_BKD[..., 7:9] + 1) / 2 * self.size
+        spread_BK2 = slots_BKD[..., 9:11] / 2 * self.size
+        line = torch.arange(self.size) + 0.5
+        x_BKHW = (line[None, :] - center_BK2[..., 0, None, None]).expand(-1, -1, self.size, -1)
+        y_BKHW = (line[:, None] - center_BK2[..., 1, None, None]).expand(-1, -1, -1, self.size)
+        sx, sy = spread_BK2[..., 0, None, None], spread_BK2[..., 1, None, None]
+        ellipse = (x_BKHW / (2 * sx)) ** 2 + (y_BKHW / (2 * sy)) ** 2 <= 1  # a disc's edge lies 2 deviations out
+        box = (x_BKHW.abs() <= 3**0.5 * sx) & (y_BKHW.abs() <= 3**0.5 * sy)  # a box's, sqrt(3)
+        beam = (x_BKHW.abs() <= 2) & (y_BKHW <= 0)
+        inside = torch.where(layer_BK11 == BOWL, ellipse, torch.where(layer_BK11 == BLOCK, box, beam))
+        inside = inside & (slots_BKD[..., -1, None, None] > 0.5) | (layer_BK11 == BACKGROUND)
+        return torch.where(inside, 40 * layer_BK11, -200.0).softmax(1)
+
+
+class OracleWorldModel:
+    """Knows the scene (`objects` gives `info["objects"]` as they are now) and does exactly what it is told.
+
+    Attributes:
+        hands_off: colours of blocks that it wrongly imagines nobody can move.
+        spare_slots: unused slots, with presence 0.
+    """
+
+    def __init__(
+        self,
+        objects: Callable[[], Sequence[Mapping[str, Any]]],
+        camera: PinholeCamera,
+        *,
+        hands_off: Sequence[str] = (),
+        spare_slots: int = 2,
+    ) -> None:
+        self.objects, self.camera, self.hands_off, self.spare_slots = objects, camera, hands_off, spare_slots
+        self.renderer = ShapeRenderer()
+        self.calls: list[int] = []  # batch size of each imagination
+
+    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+        slots = [self._slot(BACKGROUND, [0.5, 0, 0], TABLE_COLOR), self._slot(ARM, HOME, ROBOT_COLOR)]
+        for item in self.objects():
+            layer = BLOCK if item["kind"] == "block" else BOWL
+            position = np.asarray(item["position"], dtype=float)
+            middle = position if layer == BLOCK else position + [0, 0, BOWL_HEIGHT / 2]
+            slots.append(self._slot(layer, middle, 0.92 * np.array(COLORS[item["color"]])))
+        slots += [self._slot(BLOCK, [0.5, 0, 0], (0.5, 0.5, 0.5), presence=0.0)] * self.spare_slots
+        order = np.random.default_rng(seed).permutation(len(slots) - 1) + 1  # the slot's number must not matter
+        slots_KD = torch.stack([slots[0], *(slots[i] for i in order)])
+        return self._rollout(slots_KD[None, None], ())
+
+    def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
+        self.calls.append(len(text))
+        starts_BKD = obs.slots[:, -1].expand(len(text), -1, -1)
+        films = [self._imagine(start, Instruction.parse(t), horizon) for start, t in zip(starts_BKD, text, strict=True)]
+        return self._rollout(torch.stack(films), tuple(text))
+
+    def _imagine(self, start_KD: Tensor, instruction: Instruction, horizon: int) -> Tensor:
+        arm = self._find(start_KD, ARM, None)
+        block = self._find(start_KD, BLOCK, instruction.block)
+        bowl = self._find(start_KD, BOWL, instruction.bowl)
+        pick, place = start_KD[block, :3].double().numpy(), start_KD[bowl, :3].double().numpy()
+        place = np.array([*place[:2], 0.006 + BLOCK_SIZE / 2])
+        up, top = np.array([0, 0, 0.15]), np.array([0, 0, BLOCK_SIZE / 2 + 0.01])
+        tip = _path([HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1)
+        film_TKD = start_KD[None].repeat(horizon + 1, 1, 1)
+        for t in range(1, horizon + 1):
+            share = t / horizon
+            film_TKD[t, arm] = self._slot(ARM, tip[t], ROBOT_COLOR)
+            if instruction.block in self.hands_off:
+                continue
+            at = pick if share < 2 / 7 else place if share > 5 / 7 else tip[t] - top
+            film_TKD[t, block] = self._slot(BLOCK, at, 0.92 * np.array(COLORS[instruction.block]))
+        return film_TKD
+
+    def _find(self, slots_KD: Tensor, layer: float, color: str | None) -> int:
+        for k, slot in enumerate(slots_KD):
+            if slot[3] == layer and slot[-1] > 0.5:
+                shade = torch.tensor(COLORS[color]) * 0.92 if color else None
+                if shade is None or torch.allclose(slot[4:7] * 0.5 + 0.5, shade, atol=1e-3):
+                    return k
+        raise AssertionError(f"the oracle's scene has no {color} thing of layer {layer}")
+
+    def _slot(self, layer: float, position: Sequence[float] | np.ndarray, color: Any, presence: float = 1.0) -> Tensor:
+        position = np.asarray(position, dtype=float)
+        x, y = self.camera.project(position)
+        pixel = float(self.camera.metres_per_pixel([x, y], 0.03))
+        width, height = {
+            BLOCK: (BLOCK_SIZE / 12**0.5, BLOCK_SIZE / 12**0.5 * 1.2),
+            BOWL: (BOWL_RADIUS / 2, BOWL_RADIUS / 2 * 0.85),
+        }.get(layer, (0.05, 0.05))
+        numbers = [*position, layer, *(2 * np.asarray(color) - 1), x / 32 - 1, y / 32 - 1]
+        return torch.tensor([*numbers, width / pixel / 32, height / pixel / 32, presence], dtype=torch.float32)
+
+    def _rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...]) -> Rollout:
+        return Rollout(slots_BTKD, texts, (64, 64), LAYOUT, self.renderer)
+
+
+def _path(points: list[np.ndarray], frames: int) -> np.ndarray:
+    """Straight lines through points, at even speed per leg: (frames, 3)."""
+    legs = np.linspace(0, len(points) - 1, frames)
+    return np.stack([np.interp(legs, range(len(points)), axis) for axis in np.array(points).T], axis=1)

@@ -1,0 +1,28 @@
+import pytest
+
+from planning import Goal, Instruction, Thing
+
+
+def test_instruction_text_round_trip() -> None:
+    instruction = Instruction("red", "blue")
+    assert instruction.text == "put the red block in the blue bowl"
+    assert Instruction.parse(instruction.text) == instruction
+
+
+@pytest.mark.parametrize("text", ["", "push the red block", "put the red block in the blue bowl and the green block in the gray bowl"])
+def test_instruction_wants_exactly_one_pair(text: str) -> None:
+    with pytest.raises(ValueError, match="expected one"):
+        Instruction.parse(text)
+
+
+def test_goal_of_the_environments_grammar() -> None:
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    assert goal.pairs == (Instruction("red", "blue"), Instruction("green", "gray"))
+    assert goal.things == (Thing("red", "block"), Thing("blue", "bowl"), Thing("green", "block"), Thing("gray", "bowl"))
+
+
+def test_goal_is_checked() -> None:
+    with pytest.raises(ValueError, match="at least one pair"):
+        Goal.parse("hello")
+    with pytest.raises(ValueError, match="each block once"):
+        Goal((Instruction("red", "blue"), Instruction("red", "gray")))

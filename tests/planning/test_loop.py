@@ -1,0 +1,133 @@
+"""The closed loop in PyBullet, with the oracle in place of a trained world model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import envs  # noqa: F401  (registers the environments)
+from planning import Goal, Instruction, InstructionPlanner, PinholeCamera, RandomPlanner, SequencePlanner, run_episode
+from tests.planning.oracle import OracleWorldModel
+
+
+class CameraOnly(gym.Wrapper):  # type: ignore[type-arg]
+    """Strips `info` of everything a real robot would not have; `is_success` stays, for the result."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        obs, info = self.env.reset(**kwargs)
+        return {"rgb": obs["rgb"]}, {key: info[key] for key in ("camera", "is_success", "instruction")}
+
+    def step(self, action: Any) -> Any:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return {"rgb": obs["rgb"]}, reward, terminated, truncated, {"is_success": info["is_success"]}
+
+
+class Missing(gym.Wrapper):  # type: ignore[type-arg]
+    """A clumsy robot: the first `misses` picks land 10 cm beside the block."""
+
+    def __init__(self, env: gym.Env[Any, Any], misses: int) -> None:
+        super().__init__(env)
+        self.left = misses
+
+    def step(self, action: Any) -> Any:
+        if self.left > 0:
+            self.left -= 1
+            x = action[0] - 0.1 if action[0] > 0.5 else action[0] + 0.1
+            action = np.array([x, *action[1:]], dtype=np.float32)
+        return self.env.step(action)
+
+
+def objects_now(env: gym.Env[Any, Any]) -> list[dict[str, Any]]:
+    """The simulator's truth, for the oracle only."""
+    base = env.unwrapped
+    return [
+        {"kind": item.kind, "color": item.color, "position": base.world.pose(i)[0]}
+        for i, item in enumerate(base.scene.objects)
+    ]
+
+
+@pytest.fixture
+def env() -> Iterator[gym.Env[Any, Any]]:
+    env = gym.make("PutBlockInBowl-v0")
+    yield env
+    env.close()
+
+
+def oracle_for(env: gym.Env[Any, Any], seed: int, options: dict[str, Any] | None = None) -> OracleWorldModel:
+    _, info = env.reset(seed=seed, options=options)
+    return OracleWorldModel(lambda: objects_now(env), PinholeCamera.from_info(info["camera"]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_goal_is_reached_without_the_simulators_state(env: gym.Env[Any, Any], seed: int) -> None:
+    planner = InstructionPlanner(oracle_for(env, seed))
+    result = run_episode(CameraOnly(env), planner, seed=seed)
+    assert result.success and result.believes_reached and result.error is None
+    assert result.steps == 1 and result.attempts[0].plan.best.reaches_goal
+
+
+def test_a_variant_of_a_scene_is_judged_by_its_own_instruction(env: gym.Env[Any, Any]) -> None:
+    options = {"n_bowls": 4}
+    oracle = oracle_for(env, 3, options)
+    items = objects_now(env)
+    block = next(item["color"] for item in items if item["kind"] == "block")
+    for bowl in (item["color"] for item in items if item["kind"] == "bowl"):
+        variant = Instruction(block, bowl)
+        result = run_episode(env, InstructionPlanner(oracle), seed=3, options=options | {"instruction": variant.text})
+        assert result.success and result.attempts[0].instruction == variant
+
+
+def test_a_missed_pick_is_seen_and_tried_again(env: gym.Env[Any, Any]) -> None:
+    planner = InstructionPlanner(oracle_for(env, 1))
+    result = run_episode(Missing(env, 1), planner, seed=1)
+    assert result.success and result.steps == 2
+    assert [attempt.believes_reached for attempt in result.attempts] == [False, True]
+    once = run_episode(Missing(env, 1), planner, seed=1, replan=False)
+    assert not once.success and not once.believes_reached and once.steps == 1
+    never = run_episode(Missing(env, 9), planner, seed=1, max_attempts=2)
+    assert not never.success and never.steps == 2
+
+
+def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:
+    successes = 0
+    for seed in range(8):
+        planner = RandomPlanner(oracle_for(env, seed), np.random.default_rng(seed))
+        successes += run_episode(env, planner, seed=seed, replan=False).success
+    assert successes <= 4
+
+
+def test_what_cannot_be_grounded_ends_the_episode_with_a_reason(env: gym.Env[Any, Any]) -> None:
+    planner = InstructionPlanner(oracle_for(env, 0))
+    missing = next(color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env)))
+    result = run_episode(env, planner, Goal((Instruction(missing, missing),)), seed=0)
+    assert not result.success and result.steps == 0
+    assert result.error is not None and f"no {missing} block" in result.error
+
+
+def test_privileged_grounding_reads_the_segmentation(env: gym.Env[Any, Any]) -> None:
+    planner = InstructionPlanner(oracle_for(env, 2))
+    assert run_episode(env, planner, seed=2, privileged=True).success
+    with pytest.raises(KeyError, match="segmentation"):
+        run_episode(CameraOnly(env), planner, seed=2, privileged=True)
+
+
+@pytest.mark.parametrize("replan", [True, False])
+def test_goals_of_two_steps(replan: bool) -> None:
+    env = gym.make("PutBlocksInBowls-v0")
+    for seed in range(2):
+        planner = SequencePlanner(oracle_for(env, seed))
+        result = run_episode(CameraOnly(env), planner, seed=seed, replan=replan)
+        assert result.success and result.believes_reached
+        assert result.steps == len(Goal.parse(env.reset(seed=seed)[1]["instruction"]).pairs) >= 2
+    env.close()
+
+
+def test_the_wrong_control_mode_is_refused() -> None:
+    env = gym.make("PutBlockInBowl-v0", control="ee")
+    with pytest.raises(ValueError, match="primitive"):
+        run_episode(env, InstructionPlanner(oracle_for(env, 0)), seed=0)
+    env.close()

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from planning import AppearanceGrounder, Controller, Goal, GroundingError, Instruction, InstructionPlanner, RandomPlanner, SequencePlanner
+from tests.planning.oracle import OracleWorldModel
+
+RGB = np.zeros((64, 64, 3), np.uint8)
+PAIRS = [(block, bowl) for block in ("red", "green") for bowl in ("blue", "gray", "white")]
+
+
+@pytest.mark.parametrize(("block", "bowl"), PAIRS)
+def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, camera, block: str, bowl: str) -> None:
+    plan = InstructionPlanner(oracle).plan(RGB, Goal((Instruction(block, bowl),)), AppearanceGrounder(camera))
+    assert plan.instruction == Instruction(block, bowl)
+    assert [candidate.reaches_goal for candidate in plan.ranking] == [True] + [False] * 5
+    scores = [candidate.score for candidate in plan.ranking]
+    assert scores == sorted(scores, reverse=True)
+    assert oracle.calls == [6], "all candidates are one batch"
+    assert plan.rollout.texts == (plan.instruction.text,) and plan.seconds > 0
+
+
+def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera) -> None:
+    oracle = OracleWorldModel(lambda: objects, camera, hands_off=["red"])
+    plan = InstructionPlanner(oracle).plan(RGB, Goal.parse("put the red block in the blue bowl"), AppearanceGrounder(camera))
+    assert not any(candidate.reaches_goal for candidate in plan.ranking)
+
+
+def test_a_thing_that_is_not_there_is_an_error(oracle: OracleWorldModel, camera) -> None:
+    goal = Goal.parse("put the pink block in the blue bowl")
+    for planner in (InstructionPlanner(oracle), SequencePlanner(oracle)):
+        with pytest.raises(GroundingError, match="no pink block"):
+            planner.plan(RGB, goal, AppearanceGrounder(camera))
+
+
+def test_random_planner_repeats_with_its_generator(oracle: OracleWorldModel, camera) -> None:
+    goal = Goal.parse("put the red block in the blue bowl")
+
+    def choices(seed: int) -> list[Instruction]:
+        planner = RandomPlanner(oracle, np.random.default_rng(seed))
+        return [planner.plan(RGB, goal, AppearanceGrounder(camera)).instruction for _ in range(20)]
+
+    assert choices(0) == choices(0) != choices(1)
+    assert len(set(choices(0))) > 3
+
+
+@pytest.mark.parametrize("beam", [0, 2, 4])
+def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, camera, beam: int) -> None:
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    plan = SequencePlanner(oracle, beam=beam).plan(RGB, goal, AppearanceGrounder(camera))
+    assert plan.best.reaches_goal
+    assert set(plan.best.instructions) == set(goal.pairs)
+    assert [rollout.texts[0] for rollout in plan.rollouts] == [i.text for i in plan.best.instructions]
+    # The second step starts from where the first was imagined to end: its block lies in its bowl already.
+    first, second = plan.rollouts
+    np.testing.assert_allclose(second.slots[0, 0], first.slots[0, -1])
+    assert sum(candidate.reaches_goal for candidate in plan.ranking) in (1, 2)
+    if beam == 0:
+        assert len(plan.ranking) == 6 * 3 and sum(c.reaches_goal for c in plan.ranking) == 2
+
+
+def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, camera) -> None:
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    objects[0]["position"] = (0.60, -0.10, 0.035)  # red lies in blue
+    plan = SequencePlanner(oracle).plan(RGB, goal, AppearanceGrounder(camera))
+    assert plan.best.instructions == (Instruction("green", "gray"),)
+
+
+def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera) -> None:
+    plan = InstructionPlanner(oracle).plan(RGB, Goal.parse("put the red block in the gray bowl"), AppearanceGrounder(camera))
+    action = Controller(camera).act(plan.rollout, plan.grounding, plan.instruction)
+    np.testing.assert_allclose(action.pick, (0.45, -0.12), atol=0.01)
+    np.testing.assert_allclose(action.place, (0.42, 0.08), atol=0.01)
+    assert action.to_action().dtype == np.float32 and action.to_action().shape == (4,)
