@@ -34,6 +34,8 @@ class StudyProgress:
 
     def __init__(self, parts: Mapping[str, tuple[int, float]], console: Console | None = None) -> None:
         self.console = console or Console()
+        if not self.console.is_terminal:
+            self.console.width = 120  # a file has no width; the 80 that rich assumes would cut the tables
         self._bars = Progress(
             TextColumn("{task.description:<22}"),
             BarColumn(bar_width=28),
@@ -79,6 +81,14 @@ class StudyProgress:
         self._tables = tables
         self._live.update(self._draw())
 
+    def expect(self, part: str, total: int) -> None:
+        """Say that a part has another number of units than was thought at first."""
+        before, seconds = self._parts[part]
+        self._parts[part] = (total, seconds)
+        self._bars.update(self._tasks[part], total=total)
+        self._total += (total - before) * seconds
+        self._whole.update(self._whole_task, total=self._total)
+
     def track(self, part: str, units: Iterable[T]) -> Iterator[T]:
         """Pass the finished units of a part through, advancing its bar."""
         total, seconds = self._parts[part]
@@ -92,6 +102,11 @@ class StudyProgress:
                 done == total or done * 5 // total != (done - 1) * 5 // total
             ):
                 self._print_line(part, done, total)
+
+    def print(self, *tables: Table) -> None:
+        """Print finished tables, with intervals where there is room for them."""
+        for table in tables:
+            self.console.print(table.to_rich(intervals=self.console.width >= 110))
 
     def _print_line(self, part: str, done: int, total: int) -> None:
         elapsed = time.monotonic() - self._started

@@ -70,7 +70,7 @@ class Table:
         table.caption, table.caption_justify, table.caption_style = self.caption or None, "left", "dim"
         table.add_column("")
         for column in self.columns:
-            table.add_column(column, justify="right")
+            table.add_column(column, justify="right", no_wrap=len(column) < 9)
         for row in self.rows:
             cells = [
                 f"{c.text}\n[dim not bold not italic]{c.interval}[/]" if intervals and c.interval else c.text

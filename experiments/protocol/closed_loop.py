@@ -1,0 +1,112 @@
+"""The closed loop: does a robot that plans in imagination reach the goal, judged by the simulator alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from experiments.protocol.predicted import HORIZON
+from experiments.protocol.scenes import Drawn, TestScene, draw, play
+from experiments.protocol.workers import Worker
+from planning import (
+    EpisodeResult,
+    Goal,
+    InstructionPlanner,
+    Planner,
+    RandomPlanner,
+    SequencePlanner,
+    run_episode,
+)
+
+Method = Literal["random candidate", "expert", "ours", "ours, privileged"]
+
+
+@dataclass(frozen=True)
+class LoopOutcome:
+    """What came of one episode.
+
+    Attributes:
+        episode: which one.
+        text: the goal.
+        success: the simulator's verdict.
+        believes_reached: the planner's own verdict; None for the expert.
+        steps: pick-and-places carried out.
+        ranked_first: whether the candidate that scored best is the one that the goal names; None for goals of
+            several steps and for methods that do not rank.
+        planning_seconds: mean time of a plan; None without one.
+        error: why the loop gave up, or None.
+    """
+
+    episode: LoopEpisode
+    text: str
+    success: bool
+    believes_reached: bool | None
+    steps: int
+    ranked_first: bool | None
+    planning_seconds: float | None
+    error: str | None
+
+
+@dataclass(frozen=True)
+class LoopEpisode:
+    """A unit of work: one method, one scene, one goal.
+
+    Attributes:
+        method: who acts.
+        scene: where.
+        variant: 0 for the scene's own instruction, i for its i-th variant with another target bowl.
+        variants: how many variants there are.
+        seed: of the slot sampling and of the random candidate.
+    """
+
+    method: Method
+    scene: TestScene
+    variant: int = 0
+    variants: int = 0
+    seed: int = 0
+
+    def run(self, worker: Worker) -> LoopOutcome:
+        """Play the episode."""
+        env = worker.environment(self.scene)
+        drawn = draw(env, self.scene, self.variants)
+        text = drawn.texts[self.variant]
+        if self.method == "expert":
+            played = play(env, drawn, self.variant)
+            return LoopOutcome(self, text, played.success, None, played.steps, None, None, None)
+        result = self.pursue(worker, drawn)
+        goal = Goal.parse(text)
+        ranked_first = None
+        if self.method != "random candidate" and len(goal.pairs) == 1:
+            ranked_first = bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.pairs
+        return LoopOutcome(
+            episode=self,
+            text=text,
+            success=result.success,
+            believes_reached=result.believes_reached,
+            steps=result.steps,
+            ranked_first=ranked_first,
+            planning_seconds=result.planning_seconds if result.attempts else None,
+            error=result.error,
+        )
+
+    def pursue(self, worker: Worker, drawn: Drawn) -> EpisodeResult:
+        """Plan and act until the goal is believed to be reached, or the attempts are used up."""
+        goal = Goal.parse(drawn.texts[self.variant])
+        return run_episode(
+            worker.environment(self.scene),
+            self._planner(worker, goal),
+            goal,
+            seed=self.scene.seed,
+            options=drawn.options(self.variant),
+            privileged=self.method == "ours, privileged",
+        )
+
+    def _planner(self, worker: Worker, goal: Goal) -> Planner:
+        if self.method == "random candidate":
+            # Seeded by scene and variant too: one stream for all episodes would depend on their order.
+            rng = np.random.default_rng([self.seed, self.scene.seed, self.variant])
+            return RandomPlanner(worker.world_model, rng, horizon=HORIZON, seed=self.seed)
+        kind = InstructionPlanner if len(goal.pairs) == 1 else SequencePlanner
+        return kind(worker.world_model, horizon=HORIZON, seed=self.seed)

@@ -1,0 +1,105 @@
+"""Work units on several processes, with results in order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+import gymnasium as gym
+import torch
+from joblib import Parallel, delayed
+
+from experiments.protocol.scenes import TestScene
+
+if TYPE_CHECKING:
+    from planning import Imagines
+    from textocvp import WorldModel
+
+Out = TypeVar("Out", covariant=True)
+
+
+class LoadWorldModel(Protocol):
+    """Makes the world model. Hashable and equal for equal models, so that a process makes each only once."""
+
+    def __call__(self) -> Imagines: ...
+
+    def __hash__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class LoadCheckpoint:
+    """Loads a checkpoint by its bundled name, folder or hub id."""
+
+    name: str
+
+    def __call__(self) -> WorldModel:
+        from textocvp import WorldModel
+
+        return WorldModel.from_pretrained(self.name)
+
+
+@dataclass
+class Worker:
+    """What a unit of work may use: the world model and environments, made once a process.
+
+    Attributes:
+        world_model: imagines.
+    """
+
+    world_model: Imagines
+    _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
+
+    def environment(self, scene: TestScene) -> gym.Env[Any, Any]:
+        """The environment of a scene. Building it takes longer than resetting it, so it is kept."""
+        if scene.steps not in self._environments:
+            self._environments[scene.steps] = scene.make()
+        return self._environments[scene.steps]
+
+
+class Unit(Protocol[Out]):
+    """A unit of work: data that can be sent to another process, and what to do there."""
+
+    def run(self, worker: Worker) -> Out:
+        """Do the work. Must depend on nothing but the unit and the checkpoint."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pool(Generic[Out]):
+    """Runs units on `processes` processes with one thread each, so that rounding is the same for any number.
+
+    Attributes:
+        load: makes the world model, once in each process.
+        processes: at least 1; with 1 everything runs in this process.
+    """
+
+    load: LoadWorldModel
+    processes: int
+
+    def run(self, units: Sequence[Unit[Out]]) -> Iterator[Out]:
+        """The results, in the order of the units, as they become ready."""
+        if self.processes == 1:
+            yield from (_run(self.load, unit) for unit in units)
+        else:
+            parallel = Parallel(n_jobs=self.processes, return_as="generator", pre_dispatch=2 * self.processes)
+            yield from parallel(delayed(_run)(self.load, unit) for unit in units)
+
+
+def available_cores() -> int:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@lru_cache(maxsize=1)
+def _worker(load: LoadWorldModel) -> Worker:
+    torch.set_num_threads(1)
+    return Worker(load())
+
+
+def _run(load: LoadWorldModel, unit: Unit[Out]) -> Out:
+    return unit.run(_worker(load))
