@@ -19,7 +19,9 @@ from torch import Tensor, nn
 
 from textocvp.config import ModelConfig
 from textocvp.parser import build_parser
+from textocvp.predictor import Predictor
 from textocvp.renderer import build_renderer
+from textocvp.text import TextEncoder
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -47,10 +49,6 @@ class TextOCVP(
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        # Imported here until both files exist.
-        from textocvp.predictor import Predictor
-        from textocvp.text import TextEncoder
-
         self.config = config
         self.parser = build_parser(config.parser)
         self.text = TextEncoder(config.text)

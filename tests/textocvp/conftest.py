@@ -1,0 +1,78 @@
+"""Tiny models with random weights: what the code must do whatever the weights are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from textocvp.config import ModelConfig, ParserConfig, PredictorConfig, RendererConfig, TextConfig
+from textocvp.model import TextOCVP
+from textocvp.slots import SlotLayout
+from textocvp.world_model import WorldModel
+
+SMALL_TEXT = TextConfig(kind="lexicon", dim=16, layers=1, heads=2, hidden=16)
+
+PLACED = ModelConfig(
+    name="tiny-placed",
+    parser=ParserConfig(image_size=32, num_slots=5, layout=SlotLayout(content=8), hidden=16, glimpse_size=8),
+    renderer=RendererConfig(hidden=16, glimpse_size=8),
+    text=SMALL_TEXT,
+    predictor=PredictorConfig(
+        dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, color_bias=True, feed_forwards=1
+    ),
+)
+
+PUBLISHED = ModelConfig(
+    name="tiny-published",
+    parser=ParserConfig(
+        image_size=32,
+        num_slots=4,
+        layout=SlotLayout(content=12, explicit=False),
+        initializer="gaussian",
+        iterations_first=2,
+        corrector="slot_attention",
+        encoder_channels=8,
+        encoder_stride=2,
+        transition_hidden=16,
+    ),
+    renderer=RendererConfig(kind="broadcast", channels=8),
+    text=TextConfig(kind="transformer", dim=16, layers=1, heads=2, hidden=16),
+    predictor=PredictorConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
+)
+
+
+def build(config: ModelConfig) -> TextOCVP:
+    """The model with random weights that are the same in every test."""
+    torch.manual_seed(0)
+    return TextOCVP(config).eval()
+
+
+@pytest.fixture(params=[PLACED, PUBLISHED], ids=lambda config: config.name)
+def config(request: pytest.FixtureRequest) -> ModelConfig:
+    """Each of the two families in turn."""
+    return request.param
+
+
+@pytest.fixture
+def model(config: ModelConfig) -> TextOCVP:
+    return build(config)
+
+
+@pytest.fixture
+def world_model(model: TextOCVP) -> WorldModel:
+    return WorldModel(model)
+
+
+@pytest.fixture
+def placed_world_model() -> WorldModel:
+    return WorldModel(build(PLACED))
+
+
+@pytest.fixture
+def scene() -> np.ndarray:
+    """(32, 32, 3) uint8: a red and a blue square on a dark table."""
+    image = np.full((32, 32, 3), 47, np.uint8)
+    image[4:10, 5:11] = (255, 87, 89)
+    image[18:28, 16:26] = (78, 121, 167)
+    return image
