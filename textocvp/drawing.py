@@ -12,6 +12,7 @@ import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+SUFFIXES = (".gif", ".mp4", ".png")
 #: A picture in a film is enlarged to about this many pixels a side, one in a strip to about half of it.
 READABLE = 256
 #: A strip shows at most this many moments, and a film at most this many sequences side by side.
@@ -65,8 +66,8 @@ def save_film(
         ValueError: if the suffix is another one, or `beside` has another shape.
     """
     suffix = path.suffix.lower()
-    if suffix not in (".gif", ".mp4", ".png"):
-        raise ValueError(f"cannot write {path.name!r}: the name must end in .gif, .mp4 or .png")
+    if suffix not in SUFFIXES:
+        raise ValueError(f"cannot write {path.name!r}: the name must end in {', '.join(SUFFIXES)}")
     B, T, _, H, W = frames.shape
     imagined = (frames.transpose(0, 1, 3, 4, 2) * 255).round().astype(np.uint8)
     rows = [imagined, color_masks(masks)]

@@ -253,7 +253,7 @@ class WorldModel:
             raise ValueError(
                 f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255"
             )
-        frames_NHW3 = torch.from_numpy(np.ascontiguousarray(images)).to(self.model.device)
+        frames_NHW3 = torch.from_numpy(np.array(images)).to(self.model.device)
         return frames_NHW3.permute(0, 3, 1, 2).float() / 127.5 - 1
 
     def _checked_texts(self, text: str | Sequence[str]) -> list[str]:

@@ -172,7 +172,8 @@ def test_it_cannot_be_changed_and_says_what_it_is() -> None:
     rollout.decode_masks([0])
     assert repr(rollout) == (
         "Rollout(B=2 sequences, T=4 frames, K=3 slots of 6, 32x32 pixels, "
-        "imagined from 'put block 0 in the bowl', 'put block 1 in the bowl'; masks decoded at 1, frames at 0 of 4 times)"
+        "imagined from 'put block 0 in the bowl', 'put block 1 in the bowl'; "
+        "masks decoded at 1, frames at 0 of 4 times)"
     )
     assert "parsed from frames" in repr(dataclasses.replace(rollout, texts=()))
 
@@ -216,7 +217,7 @@ def test_slots_keep_their_colour_whatever_their_number() -> None:
 
 
 def test_files_it_cannot_write_are_refused_before_anything_is_drawn(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\.gif, \.mp4 or \.png"):
+    with pytest.raises(ValueError, match=r"\.gif, \.mp4, \.png"):
         boxes().save(tmp_path / "film.webm")
     with pytest.raises(ValueError, match=r"\(T', 32, 32, 3\)"):
         boxes().save(tmp_path / "film.gif", beside=np.zeros((4, 16, 16, 3), np.uint8))

@@ -1,0 +1,150 @@
+"""The command line as a person meets it: help that teaches, files that appear, mistakes in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from tests.textocvp.conftest import PLACED, build
+from textocvp import cli
+
+TEXT = "put the red block in the blue bowl"
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> str:
+    build(PLACED).save_pretrained(tmp_path / "checkpoint")
+    return str(tmp_path / "checkpoint")
+
+
+@pytest.fixture
+def picture(tmp_path: Path, scene: np.ndarray) -> str:
+    iio.imwrite(tmp_path / "scene.png", scene)
+    return str(tmp_path / "scene.png")
+
+
+def says(capsys: pytest.CaptureFixture[str], arguments: list[str], status: int) -> str:
+    """What a failing command prints; nothing of it may be a traceback."""
+    assert cli.main(arguments) == status
+    message = capsys.readouterr().err
+    assert message.startswith("textocvp: ") and "Traceback" not in message
+    return message
+
+
+def test_a_picture_and_a_text_become_a_film(capsys, tmp_path, checkpoint, picture) -> None:
+    out = tmp_path / "imagined.gif"
+    arguments = ["rollout", picture, TEXT, "put the blue block in the red bowl", "--checkpoint", checkpoint]
+    assert cli.main([*arguments, "--horizon", "3", "--out", str(out)]) == 0
+    assert len(list(iio.imiter(out))) == 4
+    printed = capsys.readouterr()
+    assert "B=2 sequences, T=4 frames" in printed.out and str(out) in printed.out and not printed.err
+
+
+def test_another_picture_size_is_refused_or_resized(capsys, tmp_path, checkpoint, picture, scene) -> None:
+    iio.imwrite(tmp_path / "large.png", scene.repeat(2, axis=0).repeat(2, axis=1))
+    arguments = ["rollout", str(tmp_path / "large.png"), TEXT, "--checkpoint", checkpoint, "--horizon", "2"]
+    message = says(capsys, [*arguments, "--out", str(tmp_path / "no.png")], 1)
+    assert "64x64" in message and "32x32" in message and "--resize" in message
+    assert cli.main([*arguments, "--resize", "--out", str(tmp_path / "large-out.png")]) == 0
+    assert cli.main(["rollout", picture, *arguments[2:], "--out", str(tmp_path / "same.png")]) == 0
+    assert np.array_equal(iio.imread(tmp_path / "large-out.png"), iio.imread(tmp_path / "same.png"))
+
+
+def test_unknown_words_are_a_warning_line(capsys, tmp_path, checkpoint, picture) -> None:
+    arguments = ["rollout", picture, "put the flurb block in the bowl", "--checkpoint", checkpoint]
+    assert cli.main([*arguments, "--horizon", "1", "--out", str(tmp_path / "a.png")]) == 0
+    assert capsys.readouterr().err.startswith("textocvp: warning: the text encoder has never met 'flurb'")
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"picture": "nowhere.png"}, "no picture nowhere.png"),
+        ({"picture": __file__}, "no picture that can be read"),
+        ({"text": " "}, "empty text"),
+        ({"horizon": "0"}, "at least 1"),
+        ({"horizon": "99"}, "at most 8"),
+        ({"out": "film.webm"}, ".gif, .mp4, .png"),
+        ({"checkpoint": "tabletop-smal"}, "unknown checkpoint 'tabletop-smal'"),
+    ],
+)
+def test_mistakes_are_one_line(capsys, tmp_path, checkpoint, picture, changes, part) -> None:
+    given = {
+        "picture": picture,
+        "text": TEXT,
+        "horizon": "2",
+        "out": str(tmp_path / "a.gif"),
+        "checkpoint": checkpoint,
+    }
+    given.update(changes)
+    arguments = ["rollout", given["picture"], given["text"], "--horizon", given["horizon"]]
+    assert part in says(capsys, [*arguments, "--out", given["out"], "--checkpoint", given["checkpoint"]], 1)
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_info_describes_a_checkpoint(capsys, checkpoint) -> None:
+    assert cli.main(["info", checkpoint]) == 0
+    printed = capsys.readouterr().out
+    for part in ("PlacedParser", "Predictor", "GlimpseRenderer", "32x32", "window = 8", "sha256"):
+        assert part in printed
+
+
+def test_info_alone_lists_checkpoints_and_presets(capsys) -> None:
+    assert cli.main(["info"]) == 0
+    printed = capsys.readouterr().out
+    assert "tabletop-small" in printed and "savi-cater" in printed
+
+
+def test_info_about_a_damaged_checkpoint_names_the_file(capsys, checkpoint) -> None:
+    (Path(checkpoint) / "model.safetensors").write_bytes(b"no")
+    assert "model.safetensors is damaged" in says(capsys, ["info", checkpoint], 1)
+
+
+def test_training_says_what_is_missing_before_it_makes_anything(capsys, tmp_path) -> None:
+    out, nowhere = tmp_path / "run", str(tmp_path / "none.h5")
+    files = ["--data", nowhere, "--val", nowhere, "--out", str(out)]
+    assert "envs.collect" in says(capsys, ["train", "parser", *files], 1)
+    assert "savi-cater" in says(capsys, ["train", "parser", *files, "--preset", "huge"], 1)
+    assert nowhere in says(capsys, ["train", "predictor", "--parser", nowhere, *files], 1)
+    (tmp_path / "none.h5").write_text("not HDF5")
+    assert "none.h5" in says(capsys, ["train", "parser", *files], 1)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--help"], ["train", "rollout", "info"]),
+        (["rollout", "--help"], ["put the red block in the blue bowl", "--resize", "--horizon"]),
+        (["train", "--help"], ["parser", "predictor", "TensorBoard"]),
+        (["train", "parser", "--help"], ["--data", "envs.collect"]),
+        (["train", "predictor", "--help"], ["--parser", "--horizon"]),
+    ],
+)
+def test_help_teaches(capsys, arguments, parts) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert all(part in printed for part in parts)
+
+
+def test_wrong_options_exit_with_two(capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["rollout", "--colour", "red"])
+    assert stop.value.code == 2
+
+
+def test_the_module_runs_as_a_program(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "textocvp.cli", "info", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1 and "config.json" in done.stderr and "Traceback" not in done.stderr

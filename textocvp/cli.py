@@ -1,0 +1,239 @@
+"""The command line: `textocvp train parser|predictor`, `textocvp rollout`, `textocvp info`."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import numpy as np
+import tyro
+from PIL import Image, UnidentifiedImageError
+from rich.console import Console
+from rich.table import Table
+from rich.tree import Tree
+
+from textocvp.config import PRESETS, preset
+from textocvp.drawing import SUFFIXES
+from textocvp.model import CONFIG_FILE, CheckpointError, TextOCVP
+from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel, bundled_checkpoints
+
+
+class Mistake(Exception):
+    """Something the user can put right; shown without a traceback."""
+
+
+@dataclass
+class TrainCommand:
+    """Train a model, in two stages: `textocvp train parser`, then `textocvp train predictor`."""
+
+
+@dataclass
+class RolloutCommand:
+    """Imagine what happens to the scene in a picture when a sentence is carried out.
+
+    textocvp rollout scene.png "put the red block in the blue bowl" --out imagined.gif
+
+    Every text gives one sequence, drawn side by side: the imagined frames above the masks of their slots.
+    """
+
+    image: tyro.conf.Positional[Path]
+    """Picture of the scene now (PNG, JPEG, ...), from the camera the model was trained on."""
+    text: tyro.conf.Positional[str]
+    """What is to be done, in quotes."""
+    more_texts: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Other things to do with the same scene, each in quotes."""
+    out: Path = Path("imagined.gif")
+    """Where to; the ending decides: .gif and .mp4 play, .png is a strip from left to right."""
+    checkpoint: str = DEFAULT_CHECKPOINT
+    """A bundled name, a folder with config.json and model.safetensors, or a Hugging Face hub id
+    owner/name."""
+    horizon: int = 24
+    """How many frames to imagine."""
+    seed: int = 0
+    """Of the initial slots, for models that draw them at random."""
+    resize: bool = False
+    """Shrink or enlarge the picture to the size the model was trained on, instead of refusing another
+    size."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda, mps."""
+
+
+@dataclass
+class InfoCommand:
+    """Say what a checkpoint is: its parts, their sizes and every setting.
+
+    Without a name: the checkpoints that come with the package, and the presets that can be trained.
+    """
+
+    checkpoint: tyro.conf.Positional[str | None] = None
+    """A bundled name, a folder, or a Hugging Face hub id owner/name."""
+
+
+Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
+    Annotated[TrainCommand, tyro.conf.subcommand("train")],
+    Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
+    Annotated[InfoCommand, tyro.conf.subcommand("info")],
+]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status. Help and wrong options exit with status 0 and 2, as usual."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            _run(arguments)
+    except (Mistake, CheckpointError) as error:
+        print(f"textocvp: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("textocvp: stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _run(arguments: list[str]) -> None:
+    if arguments[:1] == ["train"]:
+        _train(arguments[1:])
+        return
+    command: Any = tyro.cli(
+        Command,
+        prog="textocvp",
+        description="A world model that imagines, object by object, what a sentence does to a scene.",
+        args=arguments,
+    )
+    if isinstance(command, RolloutCommand):
+        _rollout(command)
+    else:
+        _info(command)
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    print(f"textocvp: warning: {message}", file=sys.stderr)
+
+
+def _train(arguments: list[str]) -> None:
+    # Imported here because training brings libraries that take seconds to load and that the other commands
+    # never use.
+    from textocvp import train_parser, train_predictor
+    from textocvp.episodes import EpisodeFile
+    from textocvp.slot_cache import SlotCacheError
+
+    Stage = Union[  # noqa: UP007
+        Annotated[train_parser.ParserTraining, tyro.conf.subcommand("parser")],
+        Annotated[train_predictor.PredictorTraining, tyro.conf.subcommand("predictor")],
+    ]
+    chosen: Any = tyro.cli(
+        Stage,
+        prog="textocvp train",
+        description="Train in two stages: the parser on frames, then the predictor on its slots. Both show "
+        "their progress, log to TensorBoard (OUT/logs) and go on where they stopped when they are started again.",
+        args=arguments,
+    )
+    # What can be known to be wrong is said at once, before anything is built or written.
+    try:
+        if chosen.preset is not None:
+            preset(chosen.preset)
+        for path in (chosen.data, chosen.val):
+            EpisodeFile(path).close()
+    except KeyError as error:
+        raise Mistake(error.args[0]) from error
+    except (OSError, ValueError) as error:
+        raise Mistake(str(error)) from error
+    if isinstance(chosen, train_parser.ParserTraining):
+        train_parser.train(chosen)
+    else:
+        try:
+            train_predictor.train(chosen)
+        except SlotCacheError as error:
+            raise Mistake(str(error)) from error
+
+
+def _rollout(command: RolloutCommand) -> None:
+    if command.out.suffix.lower() not in SUFFIXES:
+        raise Mistake(f"--out {command.out}: the name must end in {', '.join(SUFFIXES)}")
+    try:
+        picture = Image.open(command.image).convert("RGB")
+    except FileNotFoundError:
+        raise Mistake(f"there is no picture {command.image}") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
+    world_model = WorldModel.from_pretrained(command.checkpoint, command.device)
+    H, W = world_model.image_size
+    if command.resize:
+        picture = picture.resize((W, H), Image.Resampling.BOX)
+    elif picture.size != (W, H):
+        raise Mistake(
+            f"{command.image} is {picture.size[0]}x{picture.size[1]} pixels and the model was trained on "
+            f"{W}x{H}: take the picture at that size, or add --resize"
+        )
+    try:
+        imagined = world_model.rollout(
+            np.asarray(picture),
+            (command.text, *command.more_texts),
+            horizon=command.horizon,
+            seed=command.seed,
+        )
+    except ValueError as error:
+        raise Mistake(str(error)) from error
+    print(imagined)
+    print(f"wrote {imagined.save(command.out)}")
+
+
+def _info(command: InfoCommand) -> None:
+    console = Console()
+    if command.checkpoint is None:
+        _list(console)
+        return
+    world_model = WorldModel.from_pretrained(command.checkpoint)
+    model = world_model.model
+    console.print(f"[bold]{world_model.checkpoint.name}[/bold]  {world_model!r}", highlight=False)
+    if world_model.checkpoint.sha256:
+        console.print(f"sha256 of the weights: {world_model.checkpoint.sha256}", highlight=False)
+    table = Table("part", "class", "parameters")
+    table.columns[2].justify = "right"
+    for name in ("parser", "text", "predictor", "renderer"):
+        part = getattr(model, name)
+        table.add_row(name, type(part).__name__, f"{sum(p.numel() for p in part.parameters()):,}")
+    table.add_row("whole", type(model).__name__, f"{sum(p.numel() for p in model.parameters()):,}")
+    console.print(table)
+    console.print(_tree(CONFIG_FILE, model.config.to_dict()))
+
+
+def _list(console: Console) -> None:
+    bundled = bundled_checkpoints()
+    console.print(f"Checkpoints in this package: {', '.join(bundled) or 'none'}", highlight=False)
+    table = Table("preset", "parser", "renderer", "text", "predictor", "parameters", title="Presets to train")
+    table.columns[0].no_wrap = True
+    table.columns[5].justify = "right"
+    for name, config in PRESETS.items():
+        parameters = sum(p.numel() for p in TextOCVP(config).parameters())
+        predictor = config.predictor
+        table.add_row(
+            name,
+            f"{config.parser.corrector}, {config.parser.num_slots} slots of {config.parser.layout.dim}, "
+            f"{config.parser.image_size}x{config.parser.image_size}",
+            config.renderer.kind,
+            config.text.kind,
+            f"{predictor.attention}, {predictor.layers} layers of {predictor.dim}",
+            f"{parameters:,}",
+        )
+    console.print(table)
+
+
+def _tree(name: str, settings: dict[str, Any]) -> Tree:
+    tree = Tree(name)
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            tree.add(_tree(key, value))
+        else:
+            tree.add(f"{key} = {value}")
+    return tree
+
+
+if __name__ == "__main__":
+    sys.exit(main())
