@@ -1,0 +1,49 @@
+"""The colours of the tabletop: what objects may look like, and what captions may say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+RGB = tuple[int, int, int]
+ColorSplit = Literal["seen", "unseen", "all"]
+
+COLORS: dict[str, RGB] = {
+    "blue": (78, 121, 167),
+    "green": (89, 169, 79),
+    "red": (255, 87, 89),
+    "brown": (156, 117, 95),
+    "cyan": (118, 183, 178),
+    "gray": (186, 176, 172),
+    "yellow": (237, 201, 72),
+    "pink": (255, 157, 167),
+    "purple": (176, 122, 161),
+    "white": (255, 255, 255),
+    "orange": (242, 142, 43),
+}
+"""Object colours, name -> RGB in 0..255 (the palette of CLIPort's tasks)."""
+
+SEEN: tuple[str, ...] = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
+"""Colours that captions of the train, val and test splits may name."""
+
+UNSEEN: tuple[str, ...] = ("blue", "green", "red", "pink", "purple", "white", "orange")
+"""Colours that captions of the unseen-colour test may name (CLIPort's test palette)."""
+
+CAPTION_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "unseen": UNSEEN, "all": tuple(COLORS)}
+"""Colour split -> the colours its captions may name. Distractors may have any colour."""
+
+ARM_RGB: RGB = (105, 72, 240)
+"""The one colour of every link and of the gripper.
+
+A robot knows how it looks, so the arm may carry a hue that no object has: then "this pixel is my arm" never
+depends on the scene. One colour for all links, because the world model should see one thing, not six.
+"""
+
+TABLE_RGB: RGB = (47, 47, 47)
+FLOOR_RGB: RGB = (239, 239, 239)
+
+
+def chroma(rgb: RGB) -> tuple[float, float, float]:
+    """Brightness-free colour ``(rgb - L) / (L + 0.2)``, with ``L`` the mean of ``rgb`` scaled to 0..1."""
+    r, g, b = (value / 255 for value in rgb)
+    light = (r + g + b) / 3
+    return (r - light) / (light + 0.2), (g - light) / (light + 0.2), (b - light) / (light + 0.2)

@@ -1,0 +1,97 @@
+"""Where things are on the table: the frame of the world, the workspace, and the sizes of objects.
+
+World frame: metres, z up, the table top is z = 0, the robot stands at the origin and looks along +x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Box2:
+    """An axis-aligned rectangle on the table, in metres."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+    def contains(self, x: float, y: float) -> bool:
+        return self.x[0] <= x <= self.x[1] and self.y[0] <= y <= self.y[1]
+
+    def __str__(self) -> str:
+        return f"x in [{self.x[0]}, {self.x[1]}], y in [{self.y[0]}, {self.y[1]}] (metres)"
+
+
+WORKSPACE = Box2(x=(0.25, 0.75), y=(-0.25, 0.25))
+"""Where a primitive may pick and place.
+
+CLIPort's workspace is twice as wide. In a 64x64 image of that, a block would be 3 pixels wide; ours is cut so
+that it fills the `close` camera with blocks of at least 7 pixels.
+"""
+
+SPAWN = Box2(x=(0.345, 0.705), y=(-0.16, 0.16))
+"""Where the centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting
+arm."""
+
+TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))
+"""The table top."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the objects in metres and kilograms, after scaling.
+
+    At scale 1 they are those of the paper's published frames: 6 cm blocks and 14 cm bowls (CLIPort's own are
+    4 cm and 11.4 cm).
+    """
+
+    scale: float = 1.0
+
+    @property
+    def block(self) -> float:
+        """Edge of a block."""
+        return 0.058 * self.scale
+
+    @property
+    def block_mass(self) -> float:
+        return 0.02
+
+    @property
+    def bowl_mass(self) -> float:
+        return 0.2
+
+    @property
+    def bowl_radius(self) -> float:
+        """Outer radius at the rim."""
+        return 0.069 * self.scale
+
+    @property
+    def bowl_inner_radius(self) -> float:
+        """Inner radius at the rim."""
+        return 0.064 * self.scale
+
+    @property
+    def bowl_floor_radius(self) -> float:
+        """Inner radius at the floor: wider than half a block's diagonal, so that a block can lie flat."""
+        return 0.048 * self.scale
+
+    @property
+    def bowl_foot_radius(self) -> float:
+        """Outer radius where the bowl stands on the table."""
+        return 0.052 * self.scale
+
+    @property
+    def bowl_height(self) -> float:
+        return 0.046 * self.scale
+
+    @property
+    def bowl_floor(self) -> float:
+        """Thickness of the floor."""
+        return 0.006 * self.scale
+
+    def footprint(self, kind: str) -> float:
+        """Radius in metres of the smallest upright cylinder around an object."""
+        return self.bowl_radius if kind == "bowl" else self.block * 0.5**0.5
+
+    def height(self, kind: str) -> float:
+        return self.bowl_height if kind == "bowl" else self.block

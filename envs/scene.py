@@ -1,0 +1,156 @@
+"""What a scene is: objects on a table, a goal, and where the arm starts. Plain values, no physics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot
+from typing import Any
+
+import numpy as np
+
+from envs.colors import COLORS
+from envs.geometry import WORKSPACE, Sizes
+from envs.language import ColorPair, format_instruction, parse_instruction
+
+KINDS = ("block", "bowl")
+MAX_OBJECTS = 8
+"""As many objects as fit side by side into the workspace, each visible."""
+
+
+@dataclass(frozen=True)
+class ObjectSpec:
+    """One object of a layout. ``inside`` is the id of the bowl that a block lies in; ids count from 0."""
+
+    kind: str
+    color: str
+    x: float
+    y: float
+    yaw: float = 0.0
+    inside: int | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.color} {self.kind}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene to build: objects, goal pairs of (block id, bowl id), and the arm's start as joint offsets
+    (radians)."""
+
+    objects: tuple[ObjectSpec, ...]
+    goal: tuple[tuple[int, int], ...]
+    arm_offset: tuple[float, ...] = (0.0,) * 6
+
+    @property
+    def instruction(self) -> str:
+        return format_instruction(
+            (self.objects[block].color, self.objects[bowl].color) for block, bowl in self.goal
+        )
+
+
+def find_goal(
+    objects: Sequence[ObjectSpec], instruction: str | Iterable[ColorPair]
+) -> tuple[tuple[int, int], ...]:
+    """Ids of the (block, bowl) pairs that an instruction names.
+
+    Raises:
+        ValueError: when the instruction cannot be read, or names a thing that the scene does not have.
+    """
+    wishes = parse_instruction(instruction) if isinstance(instruction, str) else tuple(instruction)
+    ids = {(item.kind, item.color): index for index, item in enumerate(objects)}
+    for wish in wishes:
+        for kind, color in zip(KINDS, wish, strict=True):
+            if (kind, color) not in ids:
+                there = ", ".join(item.name for item in objects)
+                raise ValueError(f"the scene has no {color} {kind}; it has: {there}")
+    return tuple((ids["block", wish.block], ids["bowl", wish.bowl]) for wish in wishes)
+
+
+def read_layout(items: Any, sizes: Sizes) -> tuple[ObjectSpec, ...]:
+    """Check an explicit layout: a sequence of mappings with `kind`, `color`, `xy` (metres) and optionally
+    `yaw`.
+
+    ``info["objects"]`` of an earlier `reset` is a layout too: `position` and `orientation` (a quaternion)
+    stand for `xy` and `yaw`. A block whose centre is within a bowl's floor lies in that bowl.
+
+    Raises:
+        ValueError: for anything that is not such a layout, two objects of one colour, overlapping objects, or
+            one outside the workspace; the message says what is allowed.
+    """
+    if isinstance(items, str | Mapping) or not isinstance(items, Iterable):
+        raise ValueError(f"a layout is a list of objects such as {_EXAMPLE}, not {type(items).__name__}")
+    objects = [_read_object(item) for item in items]
+    if not 2 <= len(objects) <= MAX_OBJECTS:
+        raise ValueError(f"a layout has 2 to {MAX_OBJECTS} objects, not {len(objects)}")
+    colors = [item.color for item in objects]
+    twice = sorted({color for color in colors if colors.count(color) > 1})
+    if twice:
+        raise ValueError(f"no two objects may share a colour, but {', '.join(twice)} is there more than once")
+    for kind in KINDS:
+        if all(item.kind != kind for item in objects):
+            raise ValueError(f"a layout has at least one {kind}")
+    return tuple(_find_insides(objects, sizes))
+
+
+_EXAMPLE = "{'kind': 'block', 'color': 'red', 'xy': (0.5, 0.1)}"
+
+
+def _read_object(item: Any) -> ObjectSpec:
+    if not isinstance(item, Mapping):
+        raise ValueError(f"an object of a layout is a mapping such as {_EXAMPLE}, not {item!r}")
+    kind, color = item.get("kind"), item.get("color")
+    if kind not in KINDS:
+        raise ValueError(f"unknown kind {kind!r} in a layout; allowed: {', '.join(KINDS)}")
+    if color not in COLORS:
+        raise ValueError(f"unknown colour {color!r} in a layout; allowed: {', '.join(COLORS)}")
+    try:
+        place = np.asarray(item["xy"] if "xy" in item else item["position"], dtype=float).ravel()
+        x, y = float(place[0]), float(place[1])
+        yaw = _yaw(item["orientation"]) if "orientation" in item else float(item.get("yaw", 0.0))
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise ValueError(f"the {color} {kind} needs a place 'xy' in metres, as in {_EXAMPLE}") from None
+    if not (WORKSPACE.contains(x, y) and np.isfinite(yaw)):
+        raise ValueError(f"the {color} {kind} at ({x:g}, {y:g}) is out of the workspace: {WORKSPACE}")
+    return ObjectSpec(kind, color, x, y, yaw)
+
+
+def _yaw(quaternion: Any) -> float:
+    x, y, z, w = (float(value) for value in quaternion)
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def _find_insides(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
+    """Mark the blocks that lie in bowls and refuse every other overlap."""
+    placed: list[ObjectSpec] = []
+    for item in objects:
+        inside = None
+        for index, other in enumerate(objects):
+            distance = hypot(item.x - other.x, item.y - other.y)
+            if item.kind == "block" and other.kind == "bowl" and distance <= inside_radius(sizes):
+                inside = index
+        placed.append(ObjectSpec(item.kind, item.color, item.x, item.y, item.yaw, inside))
+    filled = [item.inside for item in placed if item.inside is not None]
+    for index in filled:
+        if filled.count(index) > 1:
+            raise ValueError(
+                f"the {placed[index].name} has room for one block at the start, not {filled.count(index)}"
+            )
+    for index, item in enumerate(placed):
+        for other in placed[:index]:
+            if item.inside is not None or other.inside is not None:
+                continue
+            needed = sizes.footprint(item.kind) + sizes.footprint(other.kind)
+            if hypot(item.x - other.x, item.y - other.y) < needed:
+                raise ValueError(
+                    f"the {item.name} and the {other.name} overlap; their centres must be at least "
+                    f"{needed:.3f} m apart, or a block within {inside_radius(sizes):.3f} m of a bowl's centre "
+                    "to lie in it"
+                )
+    return placed
+
+
+def inside_radius(sizes: Sizes) -> float:
+    """How far off the bowl's centre a block can lie flat, in metres."""
+    return sizes.bowl_floor_radius - sizes.block / 2

@@ -1,0 +1,121 @@
+"""Generated shapes: the lathed bowl, for the eye and for contact. No asset package is needed."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from math import cos, hypot, pi, sin
+from pathlib import Path
+
+from envs.geometry import Sizes
+
+SEGMENTS = 24
+"""Corners of the bowl's circle as seen."""
+
+WALL_PARTS = 12
+"""Convex parts of the bowl's wall as felt: one per wall segment. A block's edge never meets their corners."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles as PyBullet takes them. Python lists, because numpy arrays are 20 times slower there."""
+
+    vertices: list[list[float]]
+    normals: list[list[float]]
+    indices: list[int]
+
+
+@cache
+def bowl_mesh(sizes: Sizes) -> Mesh:
+    """The visible bowl: a lathed profile, smooth around the axis, with an edge between two bands of the
+    profile."""
+    profile = _bowl_profile(sizes)
+    vertices: list[list[float]] = []
+    normals: list[list[float]] = []
+    indices: list[int] = []
+    for (r0, z0), (r1, z1) in pairwise(profile):
+        length = hypot(r1 - r0, z1 - z0)
+        # The profile runs with the solid on its left, so the outward normal is its direction turned right.
+        normal_r, normal_z = (z1 - z0) / length, -(r1 - r0) / length
+        first = len(vertices)
+        for k in range(SEGMENTS + 1):
+            c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
+            vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
+            normals += [[normal_r * c, normal_r * s, normal_z]] * 2
+        for k in range(SEGMENTS):
+            a = first + 2 * k
+            if r0 > 0:
+                indices += [a, a + 2, a + 1]
+            if r1 > 0:
+                indices += [a + 1, a + 2, a + 3]
+    return Mesh(vertices, normals, indices)
+
+
+def _bowl_profile(sizes: Sizes) -> list[tuple[float, float]]:
+    """(radius, height) from the outer foot over the rim to the centre of the inner floor."""
+    return [
+        (sizes.bowl_foot_radius, 0.0),
+        (sizes.bowl_radius, sizes.bowl_height),
+        (sizes.bowl_inner_radius, sizes.bowl_height),
+        (sizes.bowl_floor_radius, sizes.bowl_floor),
+        (0.0, sizes.bowl_floor),
+    ]
+
+
+@cache
+def bowl_contact_file(sizes: Sizes) -> str:
+    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its
+    wall.
+
+    A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
+    several parts; PyBullet turns each group of an OBJ file into one convex hull.
+    """
+    lines: list[str] = []
+    count = 0
+
+    def add(name: str, points: list[tuple[float, float, float]]) -> None:
+        nonlocal count
+        lines.append(f"o {name}")
+        lines.extend(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points)
+        # The hull is taken of the points; the faces only have to mention each of them.
+        lines.extend(f"f {count + 1} {count + k} {count + k + 1}" for k in range(2, len(points)))
+        count += len(points)
+
+    def ring(radius: float, z: float, first: int, last: int) -> list[tuple[float, float, float]]:
+        angles = [2 * pi * k / WALL_PARTS for k in range(first, last)]
+        return [(radius * cos(a), radius * sin(a), z) for a in angles]
+
+    foot, floor = sizes.bowl_foot_radius, sizes.bowl_floor
+    add("floor", ring(foot, 0.0, 0, WALL_PARTS) + ring(foot, floor, 0, WALL_PARTS))
+    # Walls start a little above the table: the bowl stands on its floor alone, which saves contacts.
+    start = floor / 2
+    outer_start = foot + (sizes.bowl_radius - foot) * start / sizes.bowl_height
+    for k in range(WALL_PARTS):
+        add(
+            f"wall{k}",
+            ring(outer_start, start, k, k + 2)
+            + ring(sizes.bowl_floor_radius - 0.002, start, k, k + 2)
+            + ring(sizes.bowl_radius, sizes.bowl_height, k, k + 2)
+            + ring(sizes.bowl_inner_radius, sizes.bowl_height, k, k + 2),
+        )
+    return generated_file("bowl", ".obj", "\n".join(lines) + "\n")
+
+
+def generated_file(stem: str, suffix: str, text: str) -> str:
+    """Write ``text`` once into the user's temporary folder and return the path; its name carries the
+    content's hash.
+
+    Written beside and renamed, so that processes that start together never read half a file.
+    """
+    folder = Path(tempfile.gettempdir()) / f"textocvp-envs-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}{suffix}"
+    if not path.exists() or path.read_text() != text:
+        part = path.with_suffix(f".{os.getpid()}.part")
+        part.write_text(text)
+        part.replace(path)
+    return str(path)

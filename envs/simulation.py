@@ -1,0 +1,202 @@
+"""The physical tabletop: a PyBullet world built from a scene, stepped, read out and rendered."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pybullet as p
+from gymnasium import logger
+from numpy.typing import NDArray
+
+from envs.arm import Joints, arm_urdf
+from envs.camera import Camera
+from envs.colors import COLORS, FLOOR_RGB, TABLE_RGB
+from envs.geometry import TABLE, Sizes
+from envs.scene import Scene
+from envs.shapes import bowl_contact_file, bowl_mesh
+
+GRAVITY = -9.8
+TABLE_THICKNESS = 0.04
+
+BACKGROUND, ARM, FIRST_OBJECT = 0, 1, 2
+"""Labels of a segmentation: table and floor, the arm, and object i as FIRST_OBJECT + i."""
+
+# Mild light from above the camera's shoulder, and no shadow: faces and the rim of a bowl stay readable, yet a
+# thing keeps about one colour, the one it is named after. Ambient and diffuse light add up to about 1 on a
+# face seen from above.
+LIGHT_DIRECTION = [0.5, -0.35, 1.0]
+AMBIENT, DIFFUSE = 0.74, 0.30
+
+
+@dataclass(frozen=True)
+class Image:
+    """One camera frame of size H = W."""
+
+    rgb: NDArray[np.uint8]
+    """(H, W, 3), 0..255."""
+    segmentation: NDArray[np.uint8]
+    """(H, W): 0 table and floor, 1 arm, 2 + i object i."""
+    depth: NDArray[np.float32]
+    """(H, W), metres along the optical axis; the camera's far distance where nothing is."""
+
+
+class Tabletop:
+    """One PyBullet client with a table, the arm and the objects of a scene.
+
+    A rebuild after `resetSimulation` is bit-exact, whereas PyBullet's saveState/restoreState is not
+    (measured: up to 32 mm off), so `build` is the only way back to a state.
+    """
+
+    def __init__(self, camera: Camera, sizes: Sizes, physics_hz: int, gui: bool = False) -> None:
+        self.camera = camera
+        self.sizes = sizes
+        self.physics_hz = physics_hz
+        self._view, self._projection = camera.view_matrix, camera.projection_matrix
+        self.client = _connect(gui)
+        self.arm = -1
+        self.objects: list[int] = []
+        self.blocks: set[int] = set()
+        self.steps = 0
+
+    def close(self) -> None:
+        """Disconnect. Safe to call twice."""
+        if self.client >= 0 and p.isConnected(self.client):
+            p.disconnect(self.client)
+        self.client = -1
+
+    def build(self, scene: Scene, joints: Joints) -> None:
+        """Throw everything away and build ``scene`` with the arm at ``joints`` (radians)."""
+        client = self.client
+        p.resetSimulation(physicsClientId=client)
+        # resetSimulation keeps some parameters and resets others, so all are set each time.
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=1 / self.physics_hz,
+            numSubSteps=0,
+            numSolverIterations=50,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        p.setGravity(0, 0, GRAVITY, physicsClientId=client)
+        table = self._add_table()
+        self.arm = p.loadURDF(arm_urdf(), useFixedBase=True, physicsClientId=client)
+        for index, angle in enumerate(joints):
+            p.resetJointState(self.arm, index, angle, physicsClientId=client)
+        self._add_objects(scene)
+        self.steps = 0
+        self._label = np.zeros(2 + max([table, self.arm, *self.objects]), dtype=np.uint8)
+        self._label[self.arm + 1] = ARM
+        for index, body in enumerate(self.objects):
+            self._label[body + 1] = FIRST_OBJECT + index
+
+    def step(self) -> None:
+        """One physics step."""
+        p.stepSimulation(physicsClientId=self.client)
+        self.steps += 1
+
+    def settle(self, max_steps: int) -> None:
+        """Step until all objects rest, but at most ``max_steps`` steps; never a matter of wall-clock time."""
+        for _ in range(max_steps):
+            self.step()
+            if all(self.speed(index) < 0.01 for index in range(len(self.objects))):
+                return
+
+    def pose(self, index: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Position (3, metres, centre of a block, foot of a bowl) and orientation (quaternion x y z w) of an
+        object."""
+        return p.getBasePositionAndOrientation(self.objects[index], physicsClientId=self.client)
+
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions (n, 3) and orientations (n, 4) of all objects."""
+        both = [self.pose(index) for index in range(len(self.objects))]
+        return np.array([pose[0] for pose in both]), np.array([pose[1] for pose in both])
+
+    def speed(self, index: int) -> float:
+        """Linear speed of an object plus its turning speed times a block's size, in m/s."""
+        linear, angular = p.getBaseVelocity(self.objects[index], physicsClientId=self.client)
+        return max(map(abs, linear)) + self.sizes.block * max(map(abs, angular))
+
+    def render(self) -> Image:
+        """What the camera sees now."""
+        size = self.camera.size
+        _, _, rgba, depth, bodies = p.getCameraImage(
+            size,
+            size,
+            self._view,
+            self._projection,
+            lightDirection=LIGHT_DIRECTION,
+            lightAmbientCoeff=AMBIENT,
+            lightDiffuseCoeff=DIFFUSE,
+            lightSpecularCoeff=0.0,
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+            physicsClientId=self.client,
+        )
+        bodies = np.asarray(bodies).reshape(size, size)
+        rgb = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[..., :3].copy()
+        # Painted rather than lit: the table is exactly one colour, and a floor that fills the view would cost
+        # 31 ms.
+        rgb[bodies == 0] = TABLE_RGB
+        rgb[bodies == -1] = FLOOR_RGB
+        metres = self.camera.depth_in_metres(np.asarray(depth, dtype=np.float32).reshape(size, size))
+        return Image(rgb, self._label[bodies + 1], metres)
+
+    def _add_table(self) -> int:
+        half = [(TABLE.x[1] - TABLE.x[0]) / 2, (TABLE.y[1] - TABLE.y[0]) / 2, TABLE_THICKNESS / 2]
+        center = [sum(TABLE.x) / 2, sum(TABLE.y) / 2, -TABLE_THICKNESS / 2]
+        touch = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
+        look = p.createVisualShape(p.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
+        table = p.createMultiBody(0, touch, look, center, physicsClientId=self.client)
+        assert table == 0, "render() paints body 0 as the table"
+        return table
+
+    def _add_objects(self, scene: Scene) -> None:
+        client, sizes = self.client, self.sizes
+        half = [sizes.block / 2] * 3
+        mesh = bowl_mesh(sizes)
+        # One contact shape serves all bowls, and one all blocks; only looks differ.
+        bowl_touch = p.createCollisionShape(
+            p.GEOM_MESH, fileName=bowl_contact_file(sizes), physicsClientId=client
+        )
+        block_touch = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        self.objects = []
+        for item in scene.objects:
+            rgba = [value / 255 for value in COLORS[item.color]] + [1.0]
+            floor = sizes.bowl_floor if item.inside is not None else 0.0
+            if item.kind == "block":
+                look = p.createVisualShape(
+                    p.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client
+                )
+                touch, mass, z = block_touch, sizes.block_mass, floor + sizes.block / 2
+            else:
+                look = p.createVisualShape(
+                    p.GEOM_MESH,
+                    vertices=mesh.vertices,
+                    normals=mesh.normals,
+                    indices=mesh.indices,
+                    rgbaColor=rgba,
+                    physicsClientId=client,
+                )
+                touch, mass, z = bowl_touch, sizes.bowl_mass, 0.0
+            turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])
+            body = p.createMultiBody(mass, touch, look, [item.x, item.y, z], turn, physicsClientId=client)
+            p.changeDynamics(body, -1, lateralFriction=1.0, physicsClientId=client)
+            self.objects.append(body)
+        self.blocks = {
+            body for body, item in zip(self.objects, scene.objects, strict=True) if item.kind == "block"
+        }
+
+
+def _connect(gui: bool) -> int:
+    # PyBullet ends the whole process when it finds no display, so look before asking.
+    if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        logger.warn("render_mode='human' needs a display and DISPLAY is not set: running without a window")
+        gui = False
+    client = p.connect(p.GUI if gui else p.DIRECT)
+    if client < 0:
+        raise RuntimeError(
+            "PyBullet could not start" + (" its window; use render_mode='rgb_array'" if gui else "")
+        )
+    return client

@@ -1,0 +1,70 @@
+"""Action and observation spaces of the environments."""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs.geometry import WORKSPACE
+from envs.language import CHARSET, format_instruction
+from envs.motion import MAX_SPEED, MAX_TURN
+
+EXTRAS = ("depth", "segmentation", "proprio")
+"""Observations beside `rgb` and `instruction`, on request."""
+
+EE_NAMES = ("dx", "dy", "dz", "dyaw", "suction")
+PRIMITIVE_NAMES = ("pick_x", "pick_y", "place_x", "place_y", "yaw")
+
+
+def primitive_space(place_yaw: bool) -> spaces.Box:
+    """`[pick_x, pick_y, place_x, place_y]` in metres of the world frame, and with ``place_yaw`` radians."""
+    low = [WORKSPACE.x[0], WORKSPACE.y[0]] * 2 + [-pi] * place_yaw
+    high = [WORKSPACE.x[1], WORKSPACE.y[1]] * 2 + [pi] * place_yaw
+    return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
+
+
+def ee_space(frame_time: float) -> spaces.Box:
+    """`[dx, dy, dz, dyaw, suction]`: metres and radians within a frame of ``frame_time`` seconds."""
+    high = np.array([MAX_SPEED * frame_time] * 3 + [MAX_TURN * frame_time, 1], dtype=np.float32)
+    low = np.array([*-high[:4], 0], dtype=np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
+    """The action as float32.
+
+    Raises:
+        ValueError: when it is not a finite element of ``space``.
+    """
+    try:
+        values = np.asarray(action, dtype=np.float32)
+    except (TypeError, ValueError):
+        values = np.empty(0, dtype=np.float32)
+    if values.shape == space.shape and np.isfinite(values).all() and space.contains(values):
+        return values
+    # Only the tool motion has a signed first component.
+    names = EE_NAMES if space.low[0] < 0 else PRIMITIVE_NAMES
+    raise ValueError(
+        f"{action!r} is not in the action space: [{', '.join(names[: space.low.size])}], finite numbers "
+        f"from {space.low.tolist()} to {space.high.tolist()}"
+    )
+
+
+def observation_space(size: int, far: float, max_pairs: int, extras: tuple[str, ...]) -> spaces.Dict:
+    """`rgb`, `instruction` and ``extras`` for images of ``size``, seen at most ``far`` metres away."""
+    longest = len(format_instruction([("yellow", "yellow")] * max_pairs))
+    parts: dict[str, spaces.Space[Any]] = {
+        "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
+        # Gymnasium's default charset has no space.
+        "instruction": spaces.Text(longest, min_length=1, charset=CHARSET),
+    }
+    possible: dict[str, spaces.Space[Any]] = {
+        "depth": spaces.Box(0, np.float32(far) * 1.001, (size, size), np.float32),
+        "segmentation": spaces.Box(0, 255, (size, size), np.uint8),
+        "proprio": spaces.Box(-10, 10, (11,), np.float32),
+    }
+    return spaces.Dict(parts | {name: possible[name] for name in EXTRAS if name in extras})

@@ -1,0 +1,290 @@
+"""The Gymnasium environments `PutBlockInBowl-v0` and `PutBlocksInBowls-v0`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import dist
+from typing import Any, ClassVar, Literal, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.arguments import check_choice, check_range
+from envs.camera import PRESETS, Camera
+from envs.geometry import Sizes
+from envs.goal import is_inside, is_near
+from envs.motion import Action, pick_and_place
+from envs.options import read_options
+from envs.recording import Recorder
+from envs.robot import HOME, Robot
+from envs.sampling import SceneRequest
+from envs.scene import Scene
+from envs.simulation import Tabletop
+from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
+
+Observation = dict[str, Any]
+EE_SECONDS = 5.0
+"""Time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s."""
+
+MAX_SETTLE_STEPS = 120
+HOME_TOLERANCE = 0.02
+"""How close to its resting place, in metres, the arm must be for a solved episode to end."""
+
+
+class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
+    """Put the named block into the named bowl, with a suction gripper, following one sentence.
+
+    ## Observation
+    A dict: `rgb` (H, W, 3) uint8 and `instruction` (text). With ``extras``: `depth` (H, W) float32 in metres,
+    `segmentation` (H, W) uint8 (0 table, 1 arm, 2 + i object i), `proprio` (11,) float32 (6 joint angles in
+    radians; tip x, y, z in metres; yaw in radians; 1 if something is held).
+
+    ## Action
+    ``control="primitive"``: `[pick_x, pick_y, place_x, place_y]` in metres of the world frame (with
+    ``place_yaw=True`` a fifth value: radians by which the block is turned). One step is one whole
+    pick-and-place. ``control="ee"``: `[dx, dy, dz, dyaw, suction]`; metres and radians per camera frame,
+    suction on above 0.5. One step is one camera frame. The tip stays within its reach; a downward motion
+    stops at contact.
+
+    ## Reward and end
+    The reward is the change in the share of goal pairs that are fulfilled. The episode terminates when all
+    are and the arm is back home (so both modes end alike, and a next instruction may start); it truncates
+    after ``max_steps``.
+
+    ## Info
+    Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`,
+    `target` (goal pairs as an array (P, 2) of block id and bowl id), `objects` (a list of dicts with id,
+    kind, color, position and orientation), `segmentation`, `camera` (`intrinsics` (3, 3) and `extrinsics` (4,
+    4) world -> camera, OpenCV's frame; the centre of the top-left pixel is (0.5, 0.5)), `gripper` (position,
+    yaw, holding: an object id or -1), `sim_step`. With ``record_frames=True`` also `frames` (T, H, W, 3),
+    `frame_segmentations` (T, H, W) and `frame_states`: the frames of this step, or the one of `reset`.
+
+    Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
+    ``info["instruction"]`` there, or pass ``shared_memory=False``.
+
+    ## Reset options
+    `instruction`; `layout`: a list of objects such as ``{"kind": "block", "color": "red", "xy": (0.5, 0.1)}``
+    (``info["objects"]`` of an earlier reset is one too); or a random scene with `n_objects`, `n_bowls`,
+    `color_split` ("seen", "unseen", "all"), `blocks_in_bowls` (how many other blocks start in bowls) and
+    `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles.
+
+    Args:
+        control: "primitive" or "ee".
+        image_size: height and width of the square image, in pixels.
+        camera: "close" (the workspace fills the frame) or "paper" (the camera of the paper's frames).
+        object_scale: scales blocks and bowls.
+        render_stride: physics steps between two camera frames.
+        physics_hz: physics steps per second.
+        max_steps: steps until truncation; by default 3 primitives or 75 frames for each goal pair.
+        extras: further observations, of "depth", "segmentation", "proprio".
+        place_yaw: whether a primitive has a fifth value.
+        record_frames: whether `info` holds all frames of a step.
+        render_mode: "rgb_array", "human" or None.
+
+    ## History
+    v0: first version.
+    """
+
+    # Not a ClassVar, because Gymnasium declares it so.
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}  # noqa: RUF012
+    n_pairs: int = 1
+    max_pairs: ClassVar[int] = 1
+
+    def __init__(
+        self,
+        control: Literal["primitive", "ee"] = "primitive",
+        image_size: int = 64,
+        camera: str = "close",
+        object_scale: float = 1.0,
+        render_stride: int = 16,
+        physics_hz: int = 240,
+        max_steps: int | None = None,
+        extras: Sequence[str] = (),
+        place_yaw: bool = False,
+        record_frames: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        check_choice("control", control, ("primitive", "ee"))
+        check_choice("camera", camera, PRESETS)
+        check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        for extra in extras:
+            check_choice("extras", extra, EXTRAS)
+        check_range("image_size", image_size, 16, 2048, whole=True)
+        check_range("object_scale", object_scale, 0.5, 1.1)
+        check_range("physics_hz", physics_hz, 120, 2000, whole=True)
+        check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
+        if max_steps is not None:
+            check_range("max_steps", max_steps, 1, 10**9, whole=True)
+        self.control, self.render_mode = control, render_mode
+        self.extras, self.place_yaw, self.record_frames = tuple(extras), place_yaw, record_frames
+        per_pair = 3 if control == "primitive" else round(EE_SECONDS * physics_hz / render_stride)
+        self.max_steps = max_steps or per_pair * self.n_pairs
+        self.metadata = self.metadata | {"render_fps": max(1, round(physics_hz / render_stride))}
+        self.camera = Camera(PRESETS[camera], image_size)
+        primitive = control == "primitive"
+        self._box = primitive_space(place_yaw) if primitive else ee_space(render_stride / physics_hz)
+        self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
+        self.observation_space = observation_space(
+            image_size, self.camera.preset.far, self.max_pairs, self.extras
+        )
+        self.world = Tabletop(self.camera, Sizes(object_scale), physics_hz, gui=render_mode == "human")
+        self.robot = Robot(self.world, render_stride)
+        self._recorder = Recorder(self.world, self.robot)
+        self._scene: Scene | None = None
+        self._elapsed = 0
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it was built, for experts; `info` has what is true now.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._scene is None:
+            raise gym.error.ResetNeeded("call reset() first")
+        return self._scene
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Build a new scene; see the class for `options`. A seed is a scene, bit for bit.
+
+        Raises:
+            ValueError: for options that are not allowed, before anything changes.
+        """
+        defaults = SceneRequest(n_pairs=self.n_pairs)
+        checked = read_options(options, defaults, self.world.sizes)
+        if checked.wishes is not None and len(checked.wishes) > self.max_pairs:
+            raise ValueError(
+                f"{type(self).__name__} takes instructions of at most {self.max_pairs} (block, bowl) pairs, "
+                f"not {len(checked.wishes)}"
+            )
+        super().reset(seed=seed)
+        scene, joints = checked.draw(self.np_random, self.world.sizes)
+        self.world.build(scene, joints)
+        self.robot.reset(joints)
+        self.robot.hold_still(MAX_SETTLE_STEPS)
+        self._scene, self._elapsed = scene, 0
+        self._recorder.restart()
+        self._recorder.capture()
+        return self._observe(), self._info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """One pick-and-place, or one camera frame of tool motion.
+
+        Raises:
+            ValueError: for an action that is not in the action space.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        before = self._fulfilled()
+        values = check_action(self._box, action)
+        self._recorder.restart()
+        if self.control == "primitive":
+            turn = float(values[4]) if self.place_yaw else 0.0
+            pick, place = (float(values[0]), float(values[1])), (float(values[2]), float(values[3]))
+            for motion in pick_and_place(self.robot, pick, place, turn):
+                self._move(motion)
+                # Rendering changes nothing in the world, so unwanted frames are not drawn.
+                if self.record_frames or self.render_mode == "human":
+                    self._recorder.capture()
+            if not self._recorder.frames:
+                self._recorder.capture()
+        else:
+            self._move(values)
+            self._recorder.capture()
+        self._elapsed += 1
+        after = self._fulfilled()
+        reward = (sum(after) - sum(before)) / len(after)
+        terminated = all(after) and self._is_home()
+        return self._observe(), reward, terminated, self._elapsed >= self.max_steps, self._info()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The newest camera frame (H, W, 3) with "rgb_array"; the window shows itself with "human"."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='rgb_array')")
+            return None
+        return self._recorder.image.rgb.copy() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Give PyBullet's memory back. Safe to call twice."""
+        self.world.close()
+
+    def _move(self, action: Action) -> None:
+        self.robot.move(action[:3], float(action[3]), bool(action[4] > 0.5))
+
+    def _fulfilled(self) -> list[bool]:
+        return [is_inside(self.world, self.robot, block, bowl) for block, bowl in self.scene.goal]
+
+    def _is_home(self) -> bool:
+        return dist(self.robot.state().position, HOME) < HOME_TOLERANCE
+
+    def _observe(self) -> Observation:
+        image, observation = self._recorder.image, {}
+        observation["rgb"] = image.rgb.copy()
+        observation["instruction"] = self.scene.instruction
+        if "depth" in self.extras:
+            observation["depth"] = image.depth.copy()
+        if "segmentation" in self.extras:
+            observation["segmentation"] = image.segmentation.copy()
+        if "proprio" in self.extras:
+            state = self._recorder.newest
+            observation["proprio"] = np.concatenate([state.arm, state.gripper])
+        return observation
+
+    def _info(self) -> dict[str, Any]:
+        world, goal, gripper = self.world, self.scene.goal, self.robot.state()
+        info: dict[str, Any] = {
+            "is_success": all(self._fulfilled()),
+            "cliport_success": all(is_near(world, block, bowl) for block, bowl in goal),
+            "instruction": self.scene.instruction,
+            "target": np.array(goal),
+            "objects": self._object_infos(),
+            "segmentation": self._recorder.image.segmentation.copy(),
+            "camera": {"intrinsics": self.camera.intrinsics, "extrinsics": self.camera.extrinsics},
+            "gripper": {
+                "position": np.array(gripper.position),
+                "yaw": gripper.yaw,
+                "holding": gripper.holding,
+            },
+            "sim_step": world.steps,
+        }
+        if self.record_frames:
+            info |= self._recorder.info()
+        return info
+
+    def _object_infos(self) -> list[dict[str, Any]]:
+        infos = []
+        for index, item in enumerate(self.scene.objects):
+            position, orientation = map(np.array, self.world.pose(index))
+            infos.append(
+                {
+                    "id": index,
+                    "kind": item.kind,
+                    "color": item.color,
+                    "position": position,
+                    "orientation": orientation,
+                }
+            )
+        return infos
+
+
+class PutBlocksInBowls(PutBlockInBowl):
+    """The long-horizon variant: the instruction lists 2 or 3 blocks, each with its bowl, in one scene.
+
+    Everything else is as in `PutBlockInBowl`.
+
+    Args:
+        n_pairs: how many (block, bowl) pairs a random goal has: 2 or 3. An instruction in `reset`'s options
+            may name 1 to 3.
+        options: the arguments of `PutBlockInBowl`.
+    """
+
+    max_pairs = 3
+
+    def __init__(self, n_pairs: int = 2, **options: Any) -> None:
+        check_range("n_pairs", n_pairs, 2, self.max_pairs, whole=True)
+        self.n_pairs = n_pairs
+        super().__init__(**options)
