@@ -130,8 +130,9 @@ def _train(arguments: list[str]) -> None:
     chosen: Any = tyro.cli(
         Stage,
         prog="textocvp train",
-        description="Train in two stages: the parser on frames, then the predictor on its slots. Both show "
-        "their progress, log to TensorBoard (OUT/logs) and go on where they stopped when they are started again.",
+        description="Train in two stages: the parser on frames, then the predictor on its slots. Both "
+        "show their progress, log to TensorBoard (OUT/logs), and go on where they stopped when they are "
+        "started again.",
         args=arguments,
     )
     # What can be known to be wrong is said at once, before anything is built or written.
