@@ -51,4 +51,4 @@ class BroadcastRenderer(Renderer):
         object_frames_BK3HW = out_BK4HW[:, :, :3]
         masks_BKHW = torch.softmax(out_BK4HW[:, :, 3].float(), dim=1)  # float: bf16 masks would not sum to 1
         frames_B3HW = (masks_BKHW[:, :, None] * object_frames_BK3HW).sum(dim=1)
-        return Rendered(frames_B3HW, masks_BKHW, object_frames_BK3HW)
+        return Rendered(frames_B3HW, masks_BKHW, lambda: object_frames_BK3HW)

@@ -69,11 +69,11 @@ class ClusterInitializer(nn.Module):
 
     def __init__(
         self,
-        seeds: int = 20,
-        rounds: int = 6,
+        seeds: int = 16,
+        rounds: int = 4,
         background_distance: float = 0.03,
-        same_chroma: float = 0.15,
-        same_luminance: float = 0.25,
+        same_chroma: float = 0.1,
+        same_luminance: float = 0.18,
         min_pixels: int = 4,
     ) -> None:
         super().__init__()

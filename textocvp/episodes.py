@@ -56,13 +56,16 @@ class EpisodeFile:
 
     Args:
         path: the HDF5 file.
+        first: use only the first so many episodes, as if the file held no others.
 
     Raises:
         FileNotFoundError: when there is no such file.
-        ValueError: when it is no episode file, is damaged, or is of another format version.
+        ValueError: when it is no episode file, is damaged, or is of another format version, or `first` is below 1.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], first: int | None = None) -> None:
+        if first is not None and first < 1:
+            raise ValueError(f"first must be at least 1 episode, not {first}")
         self.path = Path(path)
         self._file: h5py.File | None = None
         self._process = -1
@@ -100,6 +103,10 @@ class EpisodeFile:
             raise ValueError(
                 f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}"
             )
+        if first is not None:
+            self._starts, self.lengths = self._starts[:first], self.lengths[:first]
+            self.seeds, self.success = self.seeds[:first], self.success[:first]
+            self.instructions = self.instructions[:first]
 
     def __len__(self) -> int:
         """Number of episodes."""

@@ -97,9 +97,15 @@ class GlimpseRenderer(Renderer):
         masks_BKHW = self._compete(logits_BKHW, state)
         is_background = (state.presence > 1.5)[..., None]  # (B, K, 1, 1)
         shading_BKHW = torch.where(is_background, self.canvas, shading_BKHW)
-        rgb_BK3HW = (state.color[..., None, None] + 1) / 2 * (1 + shading_BKHW[:, :, None]) * 2 - 1
-        frames_B3HW = (masks_BKHW[:, :, None] * rgb_BK3HW).sum(1)
-        return Rendered(frames_B3HW, masks_BKHW, rgb_BK3HW)
+        light_BKHW = 1 + shading_BKHW
+        rgb_BK3 = (state.color + 1) / 2
+        # The masks sum to 1, so the frame is one matrix product over the slots, without K coloured pictures.
+        frames_B3N = 2 * rgb_BK3.transpose(1, 2) @ (masks_BKHW * light_BKHW).flatten(2) - 1
+
+        def draw_objects() -> Tensor:
+            return 2 * rgb_BK3[..., None, None] * light_BKHW[:, :, None] - 1
+
+        return Rendered(frames_B3N.unflatten(2, masks_BKHW.shape[2:]), masks_BKHW, draw_objects)
 
     def masks(self, slots: Tensor) -> Tensor:
         """Masks (B, K, H, W) alone, at half the cost."""

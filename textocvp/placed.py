@@ -51,9 +51,13 @@ class PlaceAttention(nn.Module):
         distance_BKN = squared_distances(color_features(state.color.float()), colors_BNC)
         logits_BKN = -self.sharpness * distance_BKN
 
-        grid_N2 = pixel_grid(H, W, device=frames.device).flatten(0, 1)
-        offset_BKN2 = (grid_N2 - state.position[:, :, None]) / (3 * state.scale[:, :, None] + self.reach)
-        place_BKN = -self.place * torch.log1p(offset_BKN2.square().sum(-1))
+        # Squared offset in units of the slot's size, added up from its two axes: far cheaper than a grid of vectors.
+        reach_BK2 = 3 * state.scale + self.reach
+        grid_HW2 = pixel_grid(H, W, device=frames.device)
+        dx_BKW = (grid_HW2[0, :, 0] - state.position[..., :1]) / reach_BK2[..., :1]
+        dy_BKH = (grid_HW2[:, 0, 1] - state.position[..., 1:]) / reach_BK2[..., 1:]
+        offset_BKHW = dx_BKW.square()[:, :, None, :] + dy_BKH.square()[..., None]
+        place_BKN = -self.place * torch.log1p(offset_BKHW).flatten(2)
 
         is_background = state.presence > 1.5
         things_BKN = (logits_BKN + place_BKN).masked_fill(state.presence < 0.5, float("-inf"))

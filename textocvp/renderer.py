@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor, nn
@@ -18,12 +19,17 @@ class Rendered:
     Attributes:
         frames_B3HW: the composed frame, -1..1 (a renderer may overshoot slightly; `Rollout` clamps).
         masks_BKHW: each slot's share of each pixel; sums to 1 over the slots.
-        object_frames_BK3HW: each slot drawn alone; the frame is their mask-weighted sum.
+        draw_objects: makes `object_frames_BK3HW`.
     """
 
     frames_B3HW: Tensor
     masks_BKHW: Tensor
-    object_frames_BK3HW: Tensor
+    draw_objects: Callable[[], Tensor]
+
+    @property
+    def object_frames_BK3HW(self) -> Tensor:
+        """Each slot drawn alone; the frame is their mask-weighted sum. K times a frame's numbers: made when asked for."""
+        return self.draw_objects()
 
 
 class Renderer(nn.Module):

@@ -44,7 +44,9 @@ class ParserTraining:
     """Folder of the run. If it holds an unfinished run, that run goes on."""
     preset: str = "tabletop-small"
     """Architecture; `textocvp info` lists the presets."""
-    steps: int = 6000
+    episodes: int | None = 2000
+    """Train on the first so many episodes of the file only."""
+    steps: int = 4000
     """Updates."""
     batch: int = 16
     """Clips an update."""
@@ -117,7 +119,7 @@ def train(args: ParserTraining) -> ParserQuality:
     model, optimizer, schedule = accelerator.prepare(model, optimizer, schedule)
     first = load_state(accelerator, args.out)
 
-    with EpisodeFile(args.data) as episodes, EpisodeFile(args.val) as held_out:
+    with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
         saved = time.monotonic()
         bar = tqdm(range(first, args.steps), initial=first, total=args.steps, desc="parser", unit="step")
         for step in bar:
