@@ -73,7 +73,7 @@ class ClusterInitializer(nn.Module):
         rounds: int = 4,
         background_distance: float = 0.03,
         same_chroma: float = 0.1,
-        same_luminance: float = 0.18,
+        same_luminance: float = 0.15,
         min_pixels: int = 4,
     ) -> None:
         super().__init__()

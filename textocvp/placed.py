@@ -35,7 +35,7 @@ class PlaceAttention(nn.Module):
     """
 
     def __init__(
-        self, sharpness: float = 60.0, stranger: float = 0.12, place: float = 1.5, reach: float = 0.08
+        self, sharpness: float = 240.0, stranger: float = 0.12, place: float = 12.0, reach: float = 0.08
     ) -> None:
         super().__init__()
         self.sharpness = sharpness

@@ -46,7 +46,7 @@ class ParserTraining:
     """Architecture; `textocvp info` lists the presets."""
     episodes: int | None = 2000
     """Train on the first so many episodes of the file only."""
-    steps: int = 4000
+    steps: int = 2000
     """Updates."""
     batch: int = 16
     """Clips an update."""
@@ -72,7 +72,7 @@ class ParserTraining:
     """Mixed precision."""
     seed: int = 0
     """Seed of weights and data order."""
-    evaluate_every: int = 1000
+    evaluate_every: int = 500
     """Updates between quality figures."""
     evaluate_episodes: int = 40
     """Held-out episodes they are measured on; the final figures use all."""
