@@ -175,7 +175,7 @@ PRESETS: dict[str, ModelConfig] = {
     "tabletop-small": ModelConfig(
         name="tabletop-small",
         predictor=PredictorConfig(
-            dim=192, layers=4, heads=8, hidden=384, attention="causal", window=40, color_bias=True, feed_forwards=1
+            dim=128, layers=4, heads=4, hidden=256, attention="causal", window=24, color_bias=True, feed_forwards=1
         ),
     ),
     # The paper's TextOCVP-SAVi at its own sizes (CATER, 64x64).

@@ -8,7 +8,6 @@ and the places that the transition expected with those that the corrector found.
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -66,8 +65,6 @@ class ParserTraining:
     """Weight of the agreement between drawn masks and attention."""
     place_weight: float = 0.1
     """Weight of the transition's error in place."""
-    recolor: float = 0.5
-    """Share of the clips whose colour channels are permuted."""
     precision: Literal["no", "bf16", "fp16"] = "no"
     """Mixed precision."""
     seed: int = 0
@@ -83,14 +80,6 @@ class ParserTraining:
 def to_frames(clips: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
     """Clips (B, T, H, W, 3) uint8 as the model's frames (B, T, 3, H, W), float in -1..1."""
     return torch.from_numpy(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
-
-
-def recolored(frames: Tensor, share: float, rng: np.random.Generator) -> Tensor:
-    """Frames (B, T, 3, H, W) with the colour channels of a share of the clips in another order."""
-    orders = np.array(list(itertools.permutations(range(3))))
-    chosen = np.where(rng.random(len(frames)) < share, rng.integers(len(orders), size=len(frames)), 0)
-    index = torch.from_numpy(orders[chosen]).to(frames.device)
-    return frames.gather(2, index[:, None, :, None, None].expand_as(frames))
 
 
 def parser_loss(model: TextOCVP, frames_BT3HW: Tensor, thing_weight: float) -> ParserLoss:
@@ -126,7 +115,7 @@ def train(args: ParserTraining) -> ParserQuality:
             rng = step_rng(args.seed, step, accelerator.process_index)
             stride = int(rng.integers(1, args.stride + 1))
             clips = episodes.random_clips(rng, args.batch, (args.clip - 1) * stride + 1)[:, ::stride]
-            frames = recolored(to_frames(clips, accelerator.device), args.recolor, rng)
+            frames = to_frames(clips, accelerator.device)
             with accelerator.autocast():
                 loss = parser_loss(model, frames, args.thing_weight)
             total = loss.total(args.mask_weight, args.place_weight)
