@@ -1,7 +1,7 @@
 """The README keeps its word: every snippet runs, in order, in an empty folder that looks like a fresh clone.
 
-A block that would take too long has comments above it, `<!-- instead: COMMANDS -->` with quick equivalents and
-`<!-- because: REASON -->`. Blocks marked `<!-- ci: NAME -->` are the commands that `.ci/run` itself runs.
+A block that would take too long has comments above it, `<!-- instead: COMMANDS -->` with quick equivalents
+and `<!-- because: REASON -->`. Blocks marked `<!-- ci: NAME -->` are the commands that `.ci/run` itself runs.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def snippets() -> Iterator[Snippet]:
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty folder with this repository's files, so that what the snippets write stays out of the repository."""
+    """An empty folder with this repository's files, so that what the snippets write stays out of the
+    repository."""
     folder = tmp_path_factory.mktemp("clone")
     for name in ("envs", "textocvp", "planning", "experiments", "pyproject.toml"):
         (folder / name).symlink_to(ROOT / name)
