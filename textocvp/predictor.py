@@ -92,8 +92,7 @@ class Predictor(nn.Module):
                 self.slot_out.weight.mul_(0.1)
                 self.slot_out.bias.zero_()
 
-    # ---- one step
-    # -------------------------------------------------------------------------------------------------
+    # ---- rollouts and teacher forcing
 
     def forward(self, slots_BTKD: Tensor, text: TextTokens) -> Tensor:
         """Teacher forced: `out[:, t]` is the prediction for frame t + 1.
@@ -152,25 +151,25 @@ class Predictor(nn.Module):
             caches = _Caches([KeyValueCache(tokens) for _ in self.layers])
         fresh = len(frames)  # frames that the caches have not seen
         for _ in range(steps):
-            if caches is not None:
-                past = frames[-fresh:]
-            else:
-                past = frames[-self.config.window :]
-            next_BTKD, map_BTnhKL = self._predict(
+            past = frames[-(self.config.window if caches is None else fresh) :]
+            next_BTKD, map_BnhKL = self._predict(
                 torch.stack(past, dim=1), memory, newest_only=True, caches=caches
             )
             frames.append(next_BTKD[:, -1])
             fresh = 1
             if return_attention:
-                maps.append(map_BTnhKL[:, -1])
+                maps.append(map_BnhKL)
         slots_BSKD = torch.stack(frames[-steps:], dim=1)
         return Imagined(slots_BSKD, torch.stack(maps, dim=1) if return_attention else None)
 
     def _predict(
         self, slots_BTKD: Tensor, memory: _TextMemory, *, newest_only: bool, caches: _Caches | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Next slots (B, T', K, D) and text attention (B, T', n, h, K, L) of all T frames, or of the newest (T' = 1)."""
-        batch, frames, slots, _ = slots_BTKD.shape
+        """The next slots after every frame (B, T, K, D), or with `newest_only` after the newest (B, 1, K, D).
+
+        Also the text attention of the newest frame (B, n, h, K, L).
+        """
+        frames, slots = slots_BTKD.shape[1:3]
         start = 0 if caches is None else caches.frames
         x_BTKC = self.slot_in(self._features(slots_BTKD)) + self._codes(start, frames)[:, None]
         x_BNC = x_BTKC.flatten(1, 2)
@@ -190,14 +189,13 @@ class Predictor(nn.Module):
                 newest=slots if cut else None,
                 cache=None if caches is None else caches.layers[index],
             )
-            maps.append(map_BhNL.unflatten(2, (frames, slots))[:, :, -1] if newest_only else map_BhNL)
+            maps.append(map_BhNL[:, :, -slots:])
         out_BTKE = self.slot_out(x_BNC).unflatten(1, (frames, slots))
         if newest_only:
-            return self._update(slots_BTKD[:, -1:], out_BTKE[:, -1:]), torch.stack(maps, dim=1)[:, None]
+            slots_BTKD, out_BTKE = slots_BTKD[:, -1:], out_BTKE[:, -1:]
         return self._update(slots_BTKD, out_BTKE), torch.stack(maps, dim=1)
 
-    # ---- its parts
-    # ------------------------------------------------------------------------------------------------
+    # ---- their parts
 
     def _features(self, slots: Tensor) -> Tensor:
         """What the network reads of each slot (..., E)."""
@@ -223,7 +221,8 @@ class Predictor(nn.Module):
         else:
             content = self.content_mean_C + self.content_std_C * content
         moved = SlotState(content, state.color, position, log_scale.exp(), state.presence).join()
-        return torch.where(state.presence >= 0.5, moved, slots)
+        # Unused slots and the canvas (presence 2) stay as they are.
+        return torch.where((state.presence >= 0.5) & (state.presence < 1.5), moved, slots)
 
     def _present(self, slots: Tensor) -> Tensor:
         """Which slots hold something (..., K), bool."""
@@ -270,7 +269,8 @@ class Predictor(nn.Module):
             )
         if not 1 <= frames <= self.config.window:
             raise ValueError(
-                f"this predictor was built for a past of 1 to {self.config.window} frames (`window`), this needs {frames}"
+                f"this predictor was built for a past of 1 to {self.config.window} frames (`window`), "
+                f"this needs {frames}"
             )
 
 

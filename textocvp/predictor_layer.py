@@ -46,7 +46,7 @@ class PredictorLayer(nn.Module):
         newest: int | None = None,
         cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Returns the `newest` last tokens (default: all) after the layer, and how they attended to the text."""
+        """The `newest` last tokens (default: all) after the layer, and how they attended to the text."""
         attended_BNC = self.self_attention(self.norm_self(x_BMC), self_bias, newest=newest, cache=cache)
         x_BNC = attended_BNC + (x_BMC if newest is None else x_BMC[:, -newest:])
         if match_BNL is not None and self.color_gain_h is not None:

@@ -88,6 +88,10 @@ class WordBatch:
     colors_BL3: Tensor
     names_color_BL: Tensor
 
+    def select(self, index: Tensor | slice) -> WordBatch:
+        """A sub-batch."""
+        return WordBatch(self.ids_BL[index], self.colors_BL3[index], self.names_color_BL[index])
+
     def permute_channels(self, order_B3: Tensor) -> WordBatch:
         """Each sentence's colours with their RGB channels reordered (training augmentation)."""
         index_BL3 = order_B3[:, None, :].expand_as(self.colors_BL3)

@@ -1,0 +1,95 @@
+"""What the predictor is trained for (stage 2): the next slots, above all those that move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from textocvp.slots import SlotLayout, SlotState
+
+MOVES = (
+    0.015  # a slot moves when its centre shifts by more than this in a frame, in -1..1: half a pixel of 64
+)
+UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
+
+
+@dataclass
+class SlotLoss:
+    """The terms, each a scalar averaged over slots with the weights of the moving ones.
+
+    Attributes:
+        position: Huber loss of the centre, in units of about a pixel.
+        scale: squared error of the log-scale, in tenths.
+        content: squared error of the content in units of its standard deviation; the whole slot's squared
+            error when slots have no explicit channels.
+    """
+
+    position: Tensor
+    scale: Tensor
+    content: Tensor
+
+    def total(self, scale_weight: float, content_weight: float) -> Tensor:
+        """The weighted sum that is minimised."""
+        return self.position + scale_weight * self.scale + content_weight * self.content
+
+    def figures(self) -> dict[str, float]:
+        """The terms, named for a log."""
+        return {f"loss/{name}": getattr(self, name).item() for name in self.__dataclass_fields__}
+
+
+def slot_loss(
+    predicted_BTKD: Tensor,
+    target_BTKD: Tensor,
+    weights_BTK: Tensor,
+    layout: SlotLayout,
+    content_std_C: Tensor | None,
+) -> SlotLoss:
+    """Compare predicted slots with the parser's.
+
+    Args:
+        weights_BTK: how much each slot counts, see `moving_weights`.
+        content_std_C: standard deviation of each content channel over the training slots; None (not needed)
+            for slots without explicit channels.
+    """
+    weights_BTK = weights_BTK / weights_BTK.sum().clamp(min=1e-6)
+    if content_std_C is None:
+        error_BTK = (predicted_BTKD - target_BTKD).square().mean(dim=-1)
+        zero = error_BTK.new_zeros(())
+        return SlotLoss(zero, zero, (weights_BTK * error_BTK).sum())
+    predicted, target = SlotState.split(predicted_BTKD, layout), SlotState.split(target_BTKD, layout)
+    off = (predicted.position - target.position) / UNIT
+    position_BTK = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none").sum(dim=-1)
+    scale_BTK = ((predicted.scale / target.scale.clamp(min=1e-3)).log() / 0.1).square().sum(dim=-1)
+    # Where the parser lost a slot for a frame its size jumps: such frames must not drown the others.
+    scale_BTK = scale_BTK.clamp(max=25.0)
+    content_BTK = ((predicted.content - target.content) / content_std_C).square().mean(dim=-1)
+    return SlotLoss(
+        (weights_BTK * position_BTK).sum(), (weights_BTK * scale_BTK).sum(), (weights_BTK * content_BTK).sum()
+    )
+
+
+def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, ever: bool) -> Tensor:
+    """How much each slot of the frames 1..T-1 counts: `moving` where it moves, 1 where it stands still, 0 if
+    unused.
+
+    Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
+
+    Args:
+        slots_BTKD: the true slots of T frames.
+        ever: weigh a slot that moves anywhere in these frames alike in all of them. For rollouts, where a
+            slot that has come to rest in the wrong place is still wrong.
+
+    Returns:
+        (B, T - 1, K).
+    """
+    if not layout.explicit:
+        return slots_BTKD.new_ones(slots_BTKD[:, 1:, :, 0].shape)
+    state = SlotState.split(slots_BTKD, layout)
+    moves_BTK = (state.position[:, 1:] - state.position[:, :-1]).norm(dim=-1) > MOVES
+    if ever:
+        moves_BTK = moves_BTK.any(dim=1, keepdim=True).expand_as(moves_BTK)
+    present_BTK = state.presence[:, 1:, :, 0] >= 0.5
+    return present_BTK * (1.0 + (moving - 1.0) * moves_BTK)

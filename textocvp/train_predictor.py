@@ -1,0 +1,301 @@
+"""Stage 2: train the text encoder and the predictor in slot space, with parser and renderer frozen.
+
+    textocvp train predictor --parser runs/parser/checkpoint --data data/tabletop-train.h5 \\
+        --val data/tabletop-val.h5 --out runs/predictor
+
+Every episode is parsed once. Then the `causal` form learns from whole episodes, all frames in one pass: first
+teacher forced; then the model imagines a growing part of the episode, up to all of it, and from its own
+imagined frames must predict the true next ones (dataset aggregation, Ross et al. 2011: what rollouts need,
+for little more than the price of teacher forcing). The published `window` form sees both ways and so cannot
+be teacher forced in one pass: it learns from rollouts, with the gradient flowing back through them, as
+published. """
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from accelerate import Accelerator
+from torch import Tensor, nn
+from tqdm import tqdm
+from transformers import get_cosine_schedule_with_warmup
+
+from textocvp.config import ModelConfig, PredictorConfig, preset
+from textocvp.episodes import EpisodeFile
+from textocvp.following import Following, FollowingTest, following_questions
+from textocvp.model import TextOCVP
+from textocvp.predictor import Predictor
+from textocvp.predictor_data import SlotBatches, true_frames
+from textocvp.predictor_loss import moving_weights, slot_loss
+from textocvp.slot_cache import SlotCache, cached_slots
+from textocvp.text import TextEncoder, WordBatch
+from textocvp.training import load_state, save_state, start, step_rng
+
+
+@dataclass
+class PredictorTraining:
+    """Train the text encoder and the predictor on the slots of a trained parser (stage 2)."""
+
+    parser: Path
+    """Checkpoint folder with the trained parser and renderer, from `textocvp train parser`."""
+    data: Path
+    """Training episodes."""
+    val: Path
+    """Held-out episodes, for the figures."""
+    out: Path
+    """Folder of the run. If it holds an unfinished run, that run goes on."""
+    preset: str | None = None
+    """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
+    window: int | None = None
+    """Longest past of the predictor in frames, instead of the preset's."""
+    color_bias: bool | None = None
+    """Colour-matching term in the text attention, instead of the preset's choice."""
+    text: Literal["transformer", "lexicon"] | None = None
+    """Text encoder, instead of the preset's choice."""
+    steps: int = 1500
+    """Updates."""
+    batch: int = 32
+    """Episodes an update."""
+    autoregressive: float = 0.4
+    """Share of the updates, the last ones, that learn from imagined frames (`window`: all do)."""
+    horizon: int = 4
+    """Frames of the first rollouts; grows linearly to the whole episode at four fifths of these updates."""
+    learning_rate: float = 1e-3
+    """Peak of the cosine schedule."""
+    warmup: int = 100
+    """Updates until the peak."""
+    clip_norm: float = 1.0
+    """Largest gradient norm."""
+    moving: float = 20.0
+    """How much more a slot counts that moves."""
+    scale_weight: float = 0.1
+    """Weight of the error in size."""
+    content_weight: float = 0.3
+    """Weight of the error in content."""
+    recolor: bool = True
+    """Permute the colour channels of scene and lexicon together."""
+    color_jitter: float = 0.03
+    """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
+    place_jitter: float = 0.01
+    """Standard deviation of the noise on the teacher's slot places, in -1..1."""
+    image_weight: float = 0.0
+    """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
+    image_frames: int = 2
+    """How many frames of each rollout are drawn for it."""
+    precision: Literal["no", "bf16", "fp16"] = "no"
+    """Mixed precision."""
+    seed: int = 0
+    """Seed of weights and data order."""
+    evaluate_every: int = 250
+    """Updates between figures."""
+    evaluate_episodes: int = 200
+    """Held-out episodes they are measured on; the final figures use all."""
+    save_minutes: float = 4.0
+    """Minutes between saved states."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What one update trains.
+
+    Attributes:
+        seen: how many true frames are given, from the first on.
+        imagined: how many frames the model adds to them itself.
+    """
+
+    seen: int
+    imagined: int
+
+
+class Dynamics(nn.Module):
+    """What stage 2 trains, as one module, so that several processes can share its gradients."""
+
+    def __init__(self, model: TextOCVP) -> None:
+        super().__init__()
+        self.text: TextEncoder = model.text
+        self.predictor: Predictor = model.predictor
+
+    def forward(self, seen_BTKD: Tensor, words: WordBatch, imagined: int) -> Tensor:
+        """Predictions (B, S, K, D), the last of which is of the frame number T + imagined (the first is
+        number 0).
+
+        The `causal` form predicts from every true and every imagined frame the next, S = T + imagined. The
+        `window` form only predicts new frames, S = imagined + 1."""
+        text = self.text.encode(words)
+        if self.predictor.config.attention == "window":
+            return self.predictor.rollout(seen_BTKD, text, imagined + 1).slots_BSKD
+        if imagined:
+            with torch.no_grad():
+                dreamt_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
+            seen_BTKD = torch.cat([seen_BTKD, dreamt_BSKD], dim=1)
+        return self.predictor(seen_BTKD, text)
+
+
+def train(args: PredictorTraining) -> Following | None:
+    """Run or continue stage 2; writes `out`/checkpoint, a whole model, and returns its figures on all of
+    `val`.
+
+    The figures are None for slots without explicit places, and on all processes but the main one.
+
+    Raises:
+        CheckpointError: if `parser` is no checkpoint.
+        SlotCacheError: if `out` holds slots of another parser or of other episodes.
+    """
+    accelerator = start(args.out, args.precision)
+    torch.manual_seed(args.seed)
+    model = assemble(args).to(accelerator.device)
+    with EpisodeFile(args.data) as episodes, EpisodeFile(args.val) as held_out:
+        with accelerator.main_process_first():
+            cache = cached_slots(model, episodes, args.out / "slots-train.h5")
+            val_cache = cached_slots(model, held_out, args.out / "slots-val.h5")
+        layout = model.config.parser.layout
+        batches = SlotBatches(
+            cache,
+            layout,
+            model.text,
+            training_frames(model.config, cache),
+            recolor=args.recolor,
+            color_jitter=args.color_jitter,
+            place_jitter=args.place_jitter,
+        )
+        test = None
+        if layout.explicit:
+            questions = following_questions(val_cache, held_out, layout)
+            test = FollowingTest(val_cache.padded(batches.frames).float(), questions, layout)
+        following = fit(args, accelerator, model, batches, test, episodes if args.image_weight > 0 else None)
+    accelerator.end_training()
+    return following
+
+
+def assemble(args: PredictorTraining) -> TextOCVP:
+    """A model with the trained parser and renderer, frozen, and a new text encoder and predictor."""
+    trained = TextOCVP.from_pretrained(args.parser)
+    config = trained.config
+    if args.preset is not None:
+        chosen = preset(args.preset)
+        config = dataclasses.replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
+    predictor, text = config.predictor, config.text
+    if args.window is not None:
+        predictor = dataclasses.replace(predictor, window=args.window)
+    if args.color_bias is not None:
+        predictor = dataclasses.replace(predictor, color_bias=args.color_bias)
+    if args.text is not None:
+        text = dataclasses.replace(text, kind=args.text)
+    model = TextOCVP(dataclasses.replace(config, predictor=predictor, text=text))
+    for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
+        part.load_state_dict(source.state_dict())
+        part.requires_grad_(False).eval()
+    return model
+
+
+def training_frames(config: ModelConfig, cache: SlotCache) -> int:
+    """Frames of a training sequence: one more than the past, so that every time code gets trained."""
+    longest = int(cache.lengths.max())
+    if config.predictor.attention == "causal":
+        return config.predictor.window + 1
+    return longest
+
+
+def fit(
+    args: PredictorTraining,
+    accelerator: Accelerator,
+    model: TextOCVP,
+    batches: SlotBatches,
+    test: FollowingTest | None,
+    episodes: EpisodeFile | None = None,
+) -> Following | None:
+    """The training loop, from wherever `args.out` says it stopped; writes `out`/checkpoint.
+
+    Args:
+        model: parser and renderer frozen.
+        batches: training slots.
+        test: held-out questions; None for slots without explicit places, whose ends cannot be read off.
+        episodes: the training episodes, to read the frames of the image loss from; None for no image loss.
+    """
+    layout = model.config.parser.layout
+    std_C = None
+    if layout.explicit:
+        mean_C, std_C = batches.content_statistics()
+        model.predictor.content_mean_C.copy_(mean_C)
+        model.predictor.content_std_C.copy_(std_C)
+        std_C = model.predictor.content_std_C
+    dynamics = Dynamics(model)
+    optimizer = torch.optim.Adam(dynamics.parameters(), lr=args.learning_rate)
+    schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)
+    dynamics, optimizer, schedule = accelerator.prepare(dynamics, optimizer, schedule)
+    first = load_state(accelerator, args.out)
+
+    saved = time.monotonic()
+    bar = tqdm(range(first, args.steps), initial=first, total=args.steps, desc="predictor", unit="step")
+    for step in bar:
+        rng = step_rng(args.seed, step, accelerator.process_index)
+        batch = batches.draw(rng, args.batch).to(accelerator.device)
+        lesson = next_lesson(args, model.config.predictor, step, batches.frames, rng)
+        with accelerator.autocast():
+            seen_BTKD = batches.noisy(rng, batch.slots_BTKD[:, : lesson.seen])
+            predicted_BSKD = dynamics(seen_BTKD, batch.words, lesson.imagined).float()
+        last = lesson.seen + lesson.imagined  # the number of the last frame that was predicted
+        first_predicted = last + 1 - predicted_BSKD.shape[1]
+        true_BTKD = batch.slots_BTKD[:, first_predicted - 1 : last + 1]
+        weights_BSK = moving_weights(true_BTKD, layout, args.moving, ever=lesson.imagined > 0)
+        loss = slot_loss(predicted_BSKD, true_BTKD[:, 1:], weights_BSK, layout, std_C)
+        total = loss.total(args.scale_weight, args.content_weight)
+        if episodes is not None:
+            drawn_BS = rng.integers(predicted_BSKD.shape[1], size=(args.batch, args.image_frames))
+            slots_BSKD = predicted_BSKD[torch.arange(args.batch)[:, None], torch.from_numpy(drawn_BS)]
+            target_BS3HW = true_frames(episodes, batch, first_predicted + drawn_BS).to(accelerator.device)
+            frames = model.renderer(slots_BSKD.flatten(0, 1)).frames_B3HW
+            total = total + args.image_weight * (frames - target_BS3HW.flatten(0, 1)).square().mean()
+        accelerator.backward(total)
+        norm = accelerator.clip_grad_norm_(dynamics.parameters(), args.clip_norm)
+        optimizer.step()
+        schedule.step()
+        optimizer.zero_grad()
+
+        if step % 20 == 0:
+            figures = {
+                "loss/total": total.item(),
+                "gradient_norm": float(norm),
+                "horizon": 1.0 + lesson.imagined,
+            }
+            accelerator.log(figures | loss.figures(), step=step)
+            bar.set_postfix(place=f"{loss.position.item():.3f}", content=f"{loss.content.item():.3f}")
+        if test is not None and (step + 1) % args.evaluate_every == 0 and accelerator.is_main_process:
+            following = test.measure(model, args.evaluate_episodes)
+            accelerator.log(following.figures(), step=step)
+            tqdm.write(f"step {step + 1}: {following}")
+        if time.monotonic() - saved > 60 * args.save_minutes:
+            save_state(accelerator, args.out, step + 1)
+            saved = time.monotonic()
+
+    save_state(accelerator, args.out, args.steps)
+    if not accelerator.is_main_process:
+        return None
+    model.save_pretrained(args.out / "checkpoint")
+    if test is None:
+        return None
+    following = test.measure(model)
+    print(f"final: {following}")
+    (args.out / "following.json").write_text(json.dumps(dataclasses.asdict(following), indent=2) + "\n")
+    return following
+
+
+def next_lesson(
+    args: PredictorTraining, predictor: PredictorConfig, step: int, frames: int, rng: np.random.Generator
+) -> Lesson:
+    """The lesson of update number `step`, for episodes of `frames` frames."""
+    begin = round(args.steps * (1 - args.autoregressive)) if predictor.attention == "causal" else 0
+    if step < begin:
+        return Lesson(frames - 1, 0)
+    grown = min(1.0, (step - begin) / max(1.0, 0.8 * (args.steps - begin)))
+    longest = min(frames - 1, args.horizon + round(grown * (frames - 1 - args.horizon)))
+    horizon = int(rng.integers((longest + 1) // 2, longest + 1))
+    if predictor.attention == "causal":
+        return Lesson(frames - horizon, horizon - 1)
+    return Lesson(int(rng.integers(1, frames - horizon + 1)), horizon - 1)
