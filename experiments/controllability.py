@@ -4,11 +4,11 @@
     python experiments/controllability.py --quick      # a first look
     python experiments/controllability.py --full       # 100 scenes x 4 instructions x 5 slot seeds
 
-The predicted study is the paper's (section 4.4): the original instruction of a scene and three variants that name
-another target bowl are imagined and judged on the imagined masks. The closed loop goes beyond the paper: a planner
-imagines every instruction that the scene allows, picks the one whose imagined end fits the goal best, its motion is
-carried out in PyBullet, and the simulator alone judges. Writes `results.json`, `timings.json`, `report.html`, plots
-and clips into `--out`.
+The predicted study is the paper's (section 4.4): the original instruction of a scene and three variants that
+name another target bowl are imagined and judged on the imagined masks. The closed loop goes beyond the paper:
+a planner imagines every instruction that the scene allows, picks the one whose imagined end fits the goal
+best, its motion is carried out in PyBullet, and the simulator alone judges. Writes `results.json`,
+`timings.json`, `report.html`, plots and clips into `--out`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,20 @@ import tyro
 from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome, Method
 from experiments.protocol.controllability_report import build_report, loop_table, predicted_table
 from experiments.protocol.figures import mean_row, rate_row
-from experiments.protocol.gallery import choose_loop, choose_predicted
+from experiments.protocol.gallery import Picture, choose_loop, choose_predicted
 from experiments.protocol.predicted import PredictedOutcome, PredictedScene
-from experiments.protocol.scenes import LOOP_COLUMNS, test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
+from experiments.protocol.scenes import LONG_GOALS, LOOP_COLUMNS, LoopColumn, test_scenes
+from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, Unit, available_cores
 from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
+from textocvp.model import CheckpointError
 
 VARIANTS = 3
 PREDICTED_METHODS = ("ours", "true frames", "wrong text", "copy frame")
 LOOP_METHODS: tuple[Method, ...] = ("ours", "ours, privileged", "expert", "random candidate")
+
+
+class UsageError(ValueError):
+    """Arguments that do not go together."""
 
 
 @dataclass
@@ -52,7 +57,7 @@ class Args:
     full: bool = False
     """100 scenes x 4 instructions x 5 slot seeds, as the paper; takes about an hour."""
     workers: int = 0
-    """Processes; 0 for one a core. Does not change any figure."""
+    """Processes; 0 for one a core. Changes no figure."""
 
     @property
     def sizes(self) -> Sizes:
@@ -61,36 +66,47 @@ class Args:
 
     def __post_init__(self) -> None:
         if self.quick and self.full:
-            raise ValueError("--quick and --full exclude each other")
+            raise UsageError("--quick and --full exclude each other")
         if self.workers < 0:
-            raise ValueError(f"--workers must be at least 0, got {self.workers}")
+            raise UsageError(f"--workers must be at least 0, got {self.workers}")
         if self.seed < 0:
-            raise ValueError(f"--seed must be at least 0, got {self.seed}")
+            raise UsageError(f"--seed must be at least 0, got {self.seed}")
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """How much is measured, in scenes.
 
     Attributes:
-        predicted_scenes: scenes of the predicted study. slot_seeds: slot-sampling seeds of each.
-        loop_scenes: scenes of each column of the closed loop for ours and the expert.
-        control_scenes: the same for privileged grounding and the random candidate.
+        predicted: of the predicted study. slot_seeds: slot-sampling seeds of each of them.
+        loop: of each column of the closed loop with the controllability scenes, for ours and the expert.
+        other: of each other column with goals of one step. long: of each column with longer goals.
+        controls: at most this many in any column for privileged grounding and the random candidate.
         clips: how many best and how many worst cases the report shows.
     """
 
-    predicted_scenes: int
+    predicted: int
     slot_seeds: int
-    loop_scenes: int
-    control_scenes: int
+    loop: int
+    other: int
+    long: int
+    controls: int
     clips: int
 
+    def scenes(self, column: LoopColumn, method: Method) -> int:
+        """How many scenes a method plays in a column of the closed loop."""
+        steps = LONG_GOALS.get(column.split, 1)
+        most = self.long if steps > 1 else self.loop if column.split == "controllability" else self.other
+        if method in ("ours", "expert"):
+            return most
+        return min(most, self.controls if steps == 1 else (self.controls + 1) // 2)
 
-QUICK = Sizes(predicted_scenes=6, slot_seeds=1, loop_scenes=3, control_scenes=2, clips=2)
-DEFAULT = Sizes(predicted_scenes=24, slot_seeds=2, loop_scenes=12, control_scenes=8, clips=3)
-FULL = Sizes(predicted_scenes=100, slot_seeds=5, loop_scenes=100, control_scenes=100, clips=6)
+
+QUICK = Sizes(predicted=8, slot_seeds=1, loop=5, other=3, long=1, controls=2, clips=3)
+DEFAULT = Sizes(predicted=36, slot_seeds=2, loop=30, other=16, long=6, controls=10, clips=3)
+FULL = Sizes(predicted=100, slot_seeds=5, loop=100, other=100, long=100, controls=100, clips=6)
 # Rough seconds of one unit on one core; they only weigh the parts in the progress bar.
-SECONDS = {"predicted study": 6.0, "closed loop": 1.6, "pictures": 2.0}
+SECONDS = {"predicted study": 2.6, "closed loop": 0.8, "long goals": 5.0, "pictures": 1.5}
 
 
 def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = None) -> Results:
@@ -112,12 +128,15 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
     asked = load().checkpoint
     pool = Pool(load, args.workers or available_cores())
     slot_seeds = tuple(range(args.seed, args.seed + sizes.slot_seeds))
-    scenes = test_scenes("controllability", sizes.predicted_scenes, args.seed)
+    scenes = test_scenes("controllability", sizes.predicted, args.seed)
     predicted_units = [PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes]
     episodes = loop_episodes(sizes, args.seed)
+    single = [episode for episode in episodes if episode.scene.steps == 1]
+    long = [episode for episode in episodes if episode.scene.steps > 1]
     parts = {
         "predicted study": len(predicted_units),
-        "closed loop": len(episodes),
+        "closed loop": len(single),
+        "long goals": len(long),
         "pictures": 4 * sizes.clips,
     }
     rows: list[Row] = []
@@ -128,15 +147,18 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
             predicted.append(outcome)
             rows = predicted_rows(predicted)
             progress.show(predicted_table(rows))
-        for episode in progress.track("closed loop", pool.run(episodes)):
-            loop.append(episode)
-            progress.show(predicted_table(rows), loop_table(loop_rows(loop)))
+        for part, some in (("closed loop", single), ("long goals", long)):
+            for episode in progress.track(part, pool.run(some)):
+                loop.append(episode)
+                if len(loop) % 5 == 0:
+                    progress.show(predicted_table(rows), loop_table(loop_rows(loop)))
         rows += loop_rows(loop)
         columns = {(column.split, column.variant): column.name for column in LOOP_COLUMNS}
         imagined = choose_predicted(predicted, VARIANTS, slot_seeds[0], sizes.clips)
         acted = choose_loop(loop, columns, sizes.clips)
         progress.expect("pictures", len(imagined) + len(acted))
-        pictures = list(progress.track("pictures", pool.run([*imagined, *acted])))
+        units: list[Unit[Picture]] = [*imagined, *acted]
+        pictures = list(progress.track("pictures", pool.run(units)))
     results = Results(
         study="controllability",
         checkpoint=Checkpoint(asked.name, asked.sha256),
@@ -162,11 +184,10 @@ def loop_episodes(sizes: Sizes, seed: int) -> list[LoopEpisode]:
     """Every episode of the closed loop, column by column."""
     episodes = []
     for column in LOOP_COLUMNS:
-        scenes = test_scenes(column.split, sizes.loop_scenes, seed)
-        for i, scene in enumerate(scenes):
+        variants = VARIANTS if column.split == "controllability" else 0
+        for i, scene in enumerate(test_scenes(column.split, sizes.scenes(column, "ours"), seed)):
             for method in LOOP_METHODS:
-                if method in ("ours", "expert") or i < sizes.control_scenes:
-                    variants = VARIANTS if column.split == "controllability" else 0
+                if i < sizes.scenes(column, method):
                     episodes.append(LoopEpisode(method, scene, column.variant, variants, seed))
     return episodes
 
@@ -283,5 +304,7 @@ def command_line(args: Args) -> str:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args))
-    except (OSError, ValueError) as error:
+    except (OSError, UsageError, CheckpointError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted; nothing was written")

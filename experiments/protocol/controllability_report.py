@@ -11,7 +11,7 @@ from experiments.protocol.predicted import PredictedOutcome
 from experiments.protocol.scenes import LOOP_COLUMNS
 from experiments.reporting import Card, Cell, Clips, Figure, Report, Results, Row, Section, Table, TableRow
 from experiments.reporting.plots import Series, curve_plot, heat_map, interval_plot
-from experiments.reporting.table import Kind
+from experiments.reporting.table import DASH, Kind
 from planning import THRESHOLDS
 
 PREDICTED_COLUMNS = ("original", "variant 1", "variant 2", "variant 3", "variants mean")
@@ -83,7 +83,7 @@ def details_table(rows: Sequence[Row], seconds: Mapping[str, Mapping[str, float]
         line("pick-and-places, random", "random candidate", "steps", 1),
         TableRow(
             "seconds a plan, ours",
-            [Cell("–" if t is None else f"{t:.2f}") for t in times],
+            [Cell(DASH if t is None else f"{t:.2f}") for t in times],
             "ours",
             "parse, imagine all candidates, score; one core, not in results.json",
         ),
@@ -106,31 +106,32 @@ def build_report(
         predicted_pictures, loop_pictures: to show. command: what to type for the same figures.
     """
     rows = results.rows
+    limits = THRESHOLDS
     predicted = Section(
         "Predicted: does the imagined scene obey the sentence?",
-        "Each scene is imagined with its own instruction and with three that name another bowl. A rollout counts when "
-        f"the arm stays within {THRESHOLDS.arm_block_px:g} px of the named block for {THRESHOLDS.hold_frames} frames "
-        f"and the block ends within {THRESHOLDS.block_bowl_px:g} px of the named bowl's centre in the last "
-        f"{THRESHOLDS.settle_frames} frames, all read off the masks. The thresholds were calibrated on the "
-        "simulator's masks, never on predictions.",
+        "Each scene is imagined with its own instruction and with three that name another bowl. A rollout "
+        f"counts when the arm stays within {limits.arm_block_px:g} px of the named block for "
+        f"{limits.hold_frames} frames and the block ends within {limits.block_bowl_px:g} px of the named "
+        f"bowl's centre in the last {limits.settle_frames} frames, all read off the masks. The thresholds "
+        "were calibrated on the simulator's masks, never on predictions.",
         [predicted_table(rows), _predicted_plot(rows), _distance_plot(outcomes)],
     )
     gallery = Section(
         "Imagined beside real",
-        "The best cases and the worst ones by where the block ends. Below the pictures: the slots' masks beside the "
-        "simulator's segmentation, one colour a thing.",
+        "The best cases and the worst ones by where the block ends. Below the pictures: the slots' masks "
+        "beside the simulator's segmentation, one colour a thing.",
         [Clips([picture.clip for picture in predicted_pictures])],
     )
     loop = Section(
         "Closed loop: does a robot that trusts it reach the goal?",
         "The planner sees a picture and a goal, imagines the candidates, and the best one's masks become a "
-        "pick-and-place. PyBullet executes it and the simulator alone judges. Afterwards the planner looks again and "
-        "replans while it does not see the goal reached, up to three times for each block.",
+        "pick-and-place. PyBullet executes it and the simulator alone judges. Afterwards the planner looks "
+        "again and replans while it does not see the goal reached, up to three times for each block.",
         [loop_table(rows), _loop_plot(rows), details_table(rows, seconds)],
     )
     acted = Section(
         "Planned beside executed",
-        "Long goals, and failures where there are any. Left: each chosen plan as it was imagined. Right: the camera.",
+        "Long goals, and failures where there are any. Left: each chosen plan, imagined. Right: the camera.",
         [Clips([picture.clip for picture in loop_pictures])],
     )
     sections = [predicted, gallery, loop, acted]
@@ -139,12 +140,12 @@ def build_report(
         figure = heat_map(
             "attention.png", maps[0].weights, maps[0].slots, maps[0].words, label="attention to words"
         )
-        text = "Text-to-slot attention of the first best case: rows are slots, columns words; mean over layers, heads and frames."
+        text = "Text-to-slot attention of the first best case, mean over layers, heads and frames."
         sections.append(Section("Which words a slot listens to", text, [figure]))
     return Report(
         title="Controllability",
-        question="Change the sentence and nothing else: does the world model imagine what it says, and can a robot "
-        "that plans with it do it?",
+        question="Change the sentence and nothing else: does the world model imagine what it says, and can a "
+        "robot that plans with it do it?",
         results=results,
         cards=_cards(results),
         sections=sections,
@@ -156,8 +157,8 @@ def _cards(results: Results) -> list[Card]:
     def card(label: str, method: str, variant: str, metric: str, compare: str) -> Card:
         row = results.find(method, variant, metric)
         if row is None:
-            return Card(label, "–", compare=compare)
-        detail = f"{row.low:.2f}–{row.high:.2f}, {row.n} scenes"
+            return Card(label, DASH, compare=compare)
+        detail = f"{row.low:.2f}{DASH}{row.high:.2f}, {row.n} scenes"
         return Card(
             label, f"{row.value:.2f}", detail, compare, row.value, method not in ("ours", "true frames")
         )
@@ -190,7 +191,9 @@ def _cards(results: Results) -> list[Card]:
     ]
 
 
-def _points(rows: Sequence[Row], method: str, metric: str, columns: Sequence[str]) -> list:  # type: ignore[type-arg]
+def _points(
+    rows: Sequence[Row], method: str, metric: str, columns: Sequence[str]
+) -> list[tuple[float, float, float] | None]:
     found = {(r.method, r.variant): (r.value, r.low, r.high) for r in rows if r.metric == metric}
     return [found.get((method, column)) for column in columns]
 

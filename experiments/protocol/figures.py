@@ -1,8 +1,8 @@
-"""From judged scenes to rows with intervals. Scenes are the independent things; seeds and variants of one are not."""
+"""From judged scenes to rows with intervals. Scenes are independent; seeds and variants of one are not."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +10,11 @@ from experiments.reporting import Row
 from textocvp.metrics import Interval, bootstrap_interval, wilson_interval
 
 
-def rate_row(method: str, split: str, variant: str, metric: str, success_NR: np.ndarray) -> Row:
+def rate_row(method: str, split: str, variant: str, metric: str, success_NR: Any) -> Row:
     """A success rate.
 
-    Repeats of one scene (slot seeds, variants) are averaged first, and the Wilson interval is that of N trials with
+    Repeats of one scene (slot seeds, variants) are averaged first, and the Wilson interval is that of N
+    trials with
     fractional successes: wider than if the repeats counted as independent, and never empty at 0 or 1.
 
     Args:
@@ -26,9 +27,7 @@ def rate_row(method: str, split: str, variant: str, metric: str, success_NR: np.
     return _row(method, split, variant, metric, interval)
 
 
-def mean_row(
-    method: str, split: str, variant: str, metric: str, values_N: Sequence[float] | np.ndarray
-) -> Row:
+def mean_row(method: str, split: str, variant: str, metric: str, values_N: Any) -> Row:
     """A mean over N scenes with its bootstrap interval."""
     return _row(method, split, variant, metric, bootstrap_interval(np.asarray(values_N, dtype=np.float64)))
 

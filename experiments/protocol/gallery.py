@@ -70,6 +70,7 @@ class PredictedPicture:
             [paint(labels_THW, colors), paint(played.segmentations, segmentation_colors(objects))],
         ]
         kind = "best" if self.best else "worst"
+        variant = "original" if self.variant == 0 else f"variant {self.variant}"
         missed = (
             f"block ends {self.miss:.1f} px from the bowl's centre" if np.isfinite(self.miss) else "not found"
         )
@@ -78,7 +79,7 @@ class PredictedPicture:
             gif=gif(grid),
             panels=("imagined", "real"),
             title=text,
-            caption=f"{'original' if self.variant == 0 else f'variant {self.variant}'}, seed {self.scene.seed}; {missed}",
+            caption=f"{variant}, seed {self.scene.seed}; {missed}",
             badge=f"{kind} {self.rank}: {'success' if self.success else 'failure'}",
             tone="good" if self.success else "bad",
         )
@@ -146,7 +147,7 @@ def choose_predicted(
 def choose_loop(
     outcomes: Sequence[LoopOutcome], columns: Mapping[tuple[str, int], str], count: int
 ) -> list[LoopPicture]:
-    """Up to `count` failures of ours, hardest goals last, and successes with the longest goals: `2 * count` in all.
+    """Up to `count` failures of ours, and successes with the longest goals: `2 * count` in all.
 
     Args:
         columns: (split, variant) -> name of the column.
@@ -169,7 +170,7 @@ def pixels(rollout: Rollout) -> np.ndarray:
 def attention_map(
     rollout: Rollout, camera: PinholeCamera, text: str, words: tuple[str, ...]
 ) -> AttentionMap | None:
-    """Attention of the named block, the named bowl, the arm and another bowl; None if they cannot be found."""
+    """Attention of the named block and bowl, the arm and another bowl; None if they cannot be found."""
     assert rollout.attention is not None
     instruction = Instruction.parse(text)
     try:

@@ -1,7 +1,8 @@
-"""The predicted study: are imagined rollouts what the sentence says, judged on their masks (paper, section 4.4)."""
+"""The predicted study: do imagined rollouts show what the sentence says? (Paper, section 4.4.)"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from planning import (
     ground,
     measure_rollout,
 )
+from textocvp import Rollout
 
 HORIZON = 24
 
@@ -43,8 +45,10 @@ class PredictedOutcome:
 
     Attributes:
         scene, texts: the scene and its V instructions, original first.
-        ours: imagined with the instruction. wrong_text: imagined with another instruction, judged for this one.
-        copy_frame: the first frame repeated. true_frames: the parser on the frames of the expert's motion; S = 1.
+        ours: imagined with the instruction. wrong_text: imagined with another instruction, judged for this
+            one.
+        copy_frame: the first frame repeated. true_frames: the parser on the frames of the expert's motion; S
+            = 1.
         expert_V: whether the expert reached the goal, judged by the simulator.
         imagined_TV, true_TV: block to bowl distance in pixels over time for the first slot seed.
     """
@@ -117,7 +121,7 @@ class PredictedScene:
         )
 
 
-def _ground(rollout, camera: PinholeCamera, instructions: list[Instruction]) -> Grounding | None:  # type: ignore[no-untyped-def]
+def _ground(rollout: Rollout, camera: PinholeCamera, instructions: list[Instruction]) -> Grounding | None:
     """By appearance, on the first frame, which all rollouts of a batch share."""
     try:
         grounding = ground(rollout.select(0), camera)[0]
@@ -126,7 +130,7 @@ def _ground(rollout, camera: PinholeCamera, instructions: list[Instruction]) -> 
     return grounding.told([thing for i in instructions for thing in (i.block_thing, i.bowl_thing)])
 
 
-def _trace(rollout, grounding: Grounding | None, instructions: list[Instruction]) -> Trace:  # type: ignore[no-untyped-def]
+def _trace(rollout: Rollout, grounding: Grounding | None, instructions: list[Instruction]) -> Trace:
     """The trace of each rollout for its instruction. What cannot be found in the picture is nowhere near."""
     length = rollout.slots.shape[1]
     rollout.decode_masks(range(length))  # all at once; the selections below find them decoded
@@ -159,7 +163,7 @@ def _judge(trace: Trace) -> tuple[Tensor, Tensor]:
     return judge(trace), trace.block_bowl_Bt[:, -judge.thresholds.settle_frames :].mean(1)
 
 
-def _stack(parts: list) -> Verdicts:  # type: ignore[type-arg]
+def _stack(parts: Sequence[Sequence[Tensor]]) -> Verdicts:
     success, miss = zip(*parts, strict=True)
     return Verdicts(torch.stack(success).numpy(), torch.stack(miss).numpy())
 

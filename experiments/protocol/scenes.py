@@ -1,4 +1,4 @@
-"""The scenes of the studies: drawn by the environments from the seeds of a split, so no data file is needed."""
+"""The scenes of the studies, drawn by the environments from the seeds of a split: no data file is needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class TestScene:
     """One scene of a split.
 
     Attributes:
-        split: its name. `two_steps` and `three_steps` are scenes of `test` seeds whose goals have 2 and 3 pairs.
+        split: its name. `two_steps` and `three_steps` are scenes of `test` seeds whose goals have 2 and 3
+            pairs.
         seed: of the environment.
         options: for `reset`; sorted items, so that a scene can be compared and hashed.
         steps: pairs of the goal.
@@ -57,8 +58,7 @@ LOOP_COLUMNS = (
     LoopColumn("two steps", "two_steps"),
     LoopColumn("three steps", "three_steps"),
 )
-# Pairs of the goal, and the episodes of the test split whose seeds the scenes of long goals have.
-_LONG = {"two_steps": (2, 2_000), "three_steps": (3, 3_000)}
+LONG_GOALS = {"two_steps": 2, "three_steps": 3}
 SCENES_PER_SEED = 10_000
 
 
@@ -68,12 +68,13 @@ def test_scenes(split: str, count: int, seed: int) -> list[TestScene]:
     Raises:
         ValueError: if there is no such split.
     """
-    if split in _LONG:
-        source, (steps, first) = SPLITS["test"], _LONG[split]
+    if split in LONG_GOALS:
+        # Seeds of the test split that no other study uses.
+        source, steps, first = SPLITS["test"], LONG_GOALS[split], 1_000 * LONG_GOALS[split]
     elif split in SPLITS:
         source, steps, first = SPLITS[split], 1, 0
     else:
-        raise ValueError(f"unknown split {split!r}; known: {', '.join([*SPLITS, *_LONG])}")
+        raise ValueError(f"unknown split {split!r}; known: {', '.join([*SPLITS, *LONG_GOALS])}")
     seeds = [source.seed(SCENES_PER_SEED * seed + first + i) for i in range(count)]
     plain = {"n_objects": 6, "color_split": "seen"}
     options = [source.options(one) if steps == 1 else plain for one in seeds]

@@ -6,25 +6,31 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import gymnasium as gym
 import torch
 from joblib import Parallel, delayed
 
 from experiments.protocol.scenes import TestScene
-
-if TYPE_CHECKING:
-    from planning import Imagines
-    from textocvp import WorldModel
+from planning import Imagines
+from textocvp import WorldModel
+from textocvp.world_model import Checkpoint
 
 Out = TypeVar("Out", covariant=True)
+
+
+class StudyModel(Imagines, Protocol):
+    """A world model that knows where it came from."""
+
+    @property
+    def checkpoint(self) -> Checkpoint: ...
 
 
 class LoadWorldModel(Protocol):
     """Makes the world model. Hashable and equal for equal models, so that a process makes each only once."""
 
-    def __call__(self) -> Imagines: ...
+    def __call__(self) -> StudyModel: ...
 
     def __hash__(self) -> int: ...
 
@@ -36,8 +42,6 @@ class LoadCheckpoint:
     name: str
 
     def __call__(self) -> WorldModel:
-        from textocvp import WorldModel
-
         return WorldModel.from_pretrained(self.name)
 
 
@@ -49,7 +53,7 @@ class Worker:
         world_model: imagines.
     """
 
-    world_model: Imagines
+    world_model: StudyModel
     _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
 
     def environment(self, scene: TestScene) -> gym.Env[Any, Any]:
@@ -68,7 +72,7 @@ class Unit(Protocol[Out]):
 
 
 @dataclass(frozen=True)
-class Pool(Generic[Out]):
+class Pool:
     """Runs units on `processes` processes with one thread each, so that rounding is the same for any number.
 
     Attributes:

@@ -79,10 +79,8 @@ def gif(
         )
         for frame in wide
     ]
-    # One palette for all frames, from the first, a middle and the last: otherwise flat colours flicker.
-    sample = Image.fromarray(
-        np.concatenate([wide[0], wide[length // 3], wide[length // 2], wide[-1]], axis=0)
-    )
+    # One palette for all frames, made from all of them: otherwise flat colours flicker.
+    sample = Image.fromarray(np.concatenate(list(wide), axis=0))
     palette = sample.quantize(colors=255, method=Image.Quantize.MEDIANCUT)
     quantized = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [int(seconds_a_frame * 1000)] * (length - 1) + [int(seconds_a_frame * 1000) * hold]

@@ -9,10 +9,10 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 
 from experiments.reporting.results import Results
-from experiments.reporting.table import Table
+from experiments.reporting.table import DASH, Table
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _seed_text(seeds: Sequence[int]) -> str:
     """`0–99` for a run of consecutive seeds, else the list; long lists are cut in the middle."""
     values = list(seeds)
     if len(values) > 2 and values == list(range(values[0], values[0] + len(values))):
-        return f"{values[0]}–{values[-1]}"
+        return f"{values[0]}{DASH}{values[-1]}"
     if len(values) > 12:
         return (
             ", ".join(map(str, values[:6])) + " … " + ", ".join(map(str, values[-3:])) + f" ({len(values)})"
@@ -148,7 +148,7 @@ def _seed_text(seeds: Sequence[int]) -> str:
 
 
 @cache
-def _template():  # type: ignore[no-untyped-def]
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("experiments.reporting", "templates"),
         autoescape=select_autoescape(["html", "j2"]),

@@ -84,7 +84,7 @@ def interval_plot(
                     solid_capstyle="round",
                 )
                 axes.plot(
-                    value, g + offset, "o", markersize=6.5, color=color, markeredgewidth=1.6,
+                    value, g + offset, "o", markersize=6, color=color, markeredgewidth=1.6,
                     markerfacecolor=theme.page if one.hollow else color, label=None if named else one.label,
                     clip_on=False, zorder=3,
                 )  # fmt: skip
@@ -108,7 +108,7 @@ def interval_plot(
         f"{one.label}: " + ", ".join(f"{g} {p[0]:.2f}" for g, p in zip(groups, one.points, strict=True) if p)
         for one in series
     )
-    height = 1.2 + len(groups) * max(0.42, 0.17 * len(series))
+    height = 1.2 + len(groups) * max(0.34, 0.115 * len(series))
     return _figure(name, draw, (5.8, height), f"{label}. {alt}", caption)
 
 

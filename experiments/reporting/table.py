@@ -11,6 +11,7 @@ from rich.table import Table as RichTable
 
 from experiments.reporting.results import Row
 
+DASH = "\u2013"
 Kind = Literal["ours", "control", "ceiling", "paper"]
 
 _STYLES: dict[Kind, str] = {"ours": "bold", "control": "dim", "ceiling": "", "paper": "italic cyan"}
@@ -28,8 +29,8 @@ class Cell:
     def of(cls, row: Row | None, digits: int = 2) -> Cell:
         """The cell of a row; a dash while there is none yet."""
         if row is None:
-            return cls("–")
-        interval = f"{row.low:.{digits}f}–{row.high:.{digits}f}"
+            return cls(DASH)
+        interval = f"{row.low:.{digits}f}{DASH}{row.high:.{digits}f}"
         return cls(f"{row.value:.{digits}f}", "" if row.low == row.high else interval, row.n)
 
 

@@ -1,7 +1,7 @@
 """A test double of the world model for whole studies: it imagines by geometry from the simulator's own poses.
 
-It listens to the environments of its process, so it knows the scene that was reset last and every frame since. That is
-cheating on purpose: the studies can then be proven without a trained checkpoint.
+It listens to the environments of its process, so it knows the scene that was reset last and every frame
+since. That is cheating on purpose: the studies can then be proven without a trained checkpoint.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import torch
 
 from envs.tabletop import PutBlockInBowl
 from planning import PinholeCamera
+from tests.planning.oracle import ARM, OracleWorldModel
 from textocvp.rollout import Rollout
 from textocvp.world_model import Checkpoint
-from tests.planning.oracle import ARM, OracleWorldModel
 
 _history: list[dict[str, Any]] = []
 
@@ -72,7 +72,9 @@ class StudyOracle:
         slots = []
         for t in range(len(video)):
             now = [{**item, "position": position_TN3[t, i]} for i, item in enumerate(_history[-1]["objects"])]
-            slots_KD = OracleWorldModel(lambda now=now: now, oracle.camera).parse(video[:1], seed=seed).slots[0, 0]
+            slots_KD = (
+                OracleWorldModel(lambda now=now: now, oracle.camera).parse(video[:1], seed=seed).slots[0, 0]
+            )
             (arm,) = (slots_KD[:, 3] == ARM).nonzero().flatten().tolist()
             color = slots_KD[arm, 4:7] * 0.5 + 0.5
             slots_KD[arm] = oracle._slot(ARM, tip_T3[t] + [0, 0, 0.01], color)
@@ -88,5 +90,3 @@ class StudyOracle:
     def _oracle(self) -> OracleWorldModel:
         camera = PinholeCamera.from_info(_history[-1]["camera"])
         return OracleWorldModel(lambda: _history[-1]["objects"], camera, hands_off=self._stubborn)
-
-

@@ -1,0 +1,71 @@
+"""Small figures and pages for the tests of reporting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments.reporting import (
+    Card,
+    Cell,
+    Checkpoint,
+    Clip,
+    Clips,
+    Report,
+    Results,
+    Row,
+    Section,
+    Table,
+    TableRow,
+)
+from experiments.reporting.clips import gif, paint, segmentation_colors
+from experiments.reporting.plots import Series, heat_map, interval_plot
+
+
+def row(value: float = 0.9, low: float = 0.8, high: float = 0.95, method: str = "ours") -> Row:
+    return Row(method, "controllability", "original", "predicted_success", value, low, high, 20)
+
+
+def results(quick: bool = False) -> Results:
+    return Results(
+        study="controllability",
+        checkpoint=Checkpoint("tabletop-small", "ab" * 32),
+        versions={"python": "3.11", "torch": "2.3"},
+        seeds={"slots": [0, 1], "scenes": list(range(50, 70))},
+        quick=quick,
+        seconds=12.5,
+        rows=[row()],
+        headline={"predicted_original": 0.9},
+    )
+
+
+def report(quick: bool = False) -> Report:
+    """A page with one block of every kind, and text that would break it if it were not escaped."""
+    table = Table(
+        "Predicted success",
+        ["original", "variant 1", "variant 2", "variant 3", "variants mean"],
+        [
+            TableRow("ours", [Cell.of(row())] * 5, "ours", "a note"),
+            TableRow("paper", [Cell("0.83")] * 5, "paper"),
+        ],
+    )
+    labels_THW = np.random.default_rng(0).integers(0, 5, (4, 16, 16))
+    film = paint(labels_THW, segmentation_colors(3))
+    clip = Clip(
+        "a.gif",
+        gif([[film, film], [film, film]]),
+        ("imagined", "real"),
+        "put <b>it</b> there",
+        badge="worst 1",
+    )
+    plot = interval_plot(
+        "p.png", ["original", "variants"], [Series("ours", [(0.9, 0.8, 1.0), None])], label="success"
+    )
+    heat = heat_map("h.png", np.eye(3), ["block", "bowl", "arm"], ["put", "the", "block"], label="attention")
+    return Report(
+        title="Controllability",
+        question="Does it?",
+        results=results(quick),
+        cards=[Card("Predicted", "0.90", share=0.9), Card("Wrong text", "0.00", share=0.0, control=True)],
+        sections=[Section("One", "Words.", [table, plot]), Section("Two", blocks=[Clips([clip]), heat])],
+        command="python experiments/controllability.py --seed 0",
+    )
