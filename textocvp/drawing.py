@@ -59,7 +59,7 @@ def save_film(
         frames: (B, T, 3, H, W) RGB 0..1.
         masks: (B, T, K, H, W).
         texts: B captions, or none.
-        beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, drawn above the imagined ones.
+        beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, drawn before the imagined ones.
         fps: frames a second.
 
     Raises:
@@ -103,13 +103,19 @@ def _real_frames(beside: np.ndarray, B: int, T: int, H: int, W: int) -> np.ndarr
 
 
 def _screen(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
-    """One moment: a column (real,) frame, masks for each sequence, at most `FILM_COLUMNS` side by side.
+    """One moment of a film. One sequence lies on its side: (real,) imagined, slots. Of several, each is a column,
+    at most `FILM_COLUMNS` of them side by side.
 
     Args:
         pictures: (B, rows, H, W, 3) uint8.
         captions: B texts.
     """
-    factor = max(1, READABLE // pictures.shape[2] // (2 if len(captions) > 1 else 1))
+    if len(captions) == 1:
+        factor = max(1, READABLE // pictures.shape[2])
+        names = ("real", "imagined", "slots")[-pictures.shape[1] :]
+        panels = [_captioned(_framed(enlarge(p, factor)), n) for p, n in zip(pictures[0], names, strict=True)]
+        return _captioned(_beside(panels), captions[0])
+    factor = max(1, READABLE // 2 // pictures.shape[2])
     columns = [
         _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in sequence], axis=0), caption)
         for sequence, caption in zip(pictures, captions, strict=True)

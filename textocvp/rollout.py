@@ -236,7 +236,8 @@ class Rollout:
         )
 
     def save(self, path: str | Path, *, beside: np.ndarray | None = None, fps: int = 6) -> Path:
-        """Draw the rollout into a file: each imagined frame above its masks, one stable colour a slot.
+        """Draw the rollout into a file: each imagined frame above its masks, one stable colour a slot; in the film
+        of a single sequence, beside its masks.
 
         Args:
             path: the suffix decides: `.gif` and `.mp4` play through time, `.png` is a strip from left to

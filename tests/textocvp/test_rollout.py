@@ -191,6 +191,15 @@ def test_a_film_plays_every_frame_large_enough_to_see(tmp_path: Path, suffix: st
     assert abs(x.mean() - 5 * scale) < 3 and abs(y.mean() - 5 * scale) < 3
 
 
+def test_a_single_sequence_lies_on_its_side(tmp_path: Path) -> None:
+    film = list(iio.imiter(boxes(B=1).save(tmp_path / "a.gif", beside=np.full((1, H, W, 3), 200, np.uint8))))
+    assert film[0].shape[1] == 3 * (256 + 4) and film[0].shape[0] < 350
+    assert (film[3][100, 100] == 200).all()
+    red = film[3].astype(int)[:256, 260:516]
+    box = (red[..., 0] > 180) & (red[..., 1] < 70)
+    assert abs(np.nonzero(box)[1].mean() - 11 * 8) < 5  # moved by 2 pixels a frame
+
+
 def test_gif_frames_last_as_long_as_asked(tmp_path: Path) -> None:
     path = boxes().save(tmp_path / "film.gif", fps=5)
     assert iio.immeta(path)["duration"] == pytest.approx(200)
