@@ -33,6 +33,9 @@ class PickAndPlace:
 class Controller:
     """Reads pick and place points off a rollout: where the block's slot starts, and where it ends.
 
+    The heights are those of a block's middle, on the table and on a bowl's floor. On the true masks of 100
+    val scenes they put the pick at most 2.6 mm and the place at most 3.3 mm off (`experiments/calibrate.py`).
+
     Attributes:
         camera: of the scene.
         pick_height: height above the table, in metres, of the point that a block's slot is centred on when it
@@ -41,8 +44,8 @@ class Controller:
     """
 
     camera: PinholeCamera
-    pick_height: float = 0.03
-    place_height: float = 0.03
+    pick_height: float = 0.029
+    place_height: float = 0.036
 
     def act(self, rollout: Rollout, grounding: Grounding, instruction: Instruction) -> PickAndPlace:
         """The action that makes an imagined rollout (B = 1) real.

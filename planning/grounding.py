@@ -43,7 +43,7 @@ COLORS: dict[str, tuple[float, float, float]] = {
 }
 
 #: The robot knows how it looks itself, and the table that it stands at. RGB 0..1.
-ROBOT_COLOR = (90 / 255, 60 / 255, 210 / 255)
+ROBOT_COLOR = (105 / 255, 72 / 255, 240 / 255)
 TABLE_COLOR = (47 / 255, 47 / 255, 47 / 255)
 
 #: A surface shows its colour times the light on it, which lies between these in the tabletop scenes.
@@ -201,7 +201,7 @@ def _ground_scene(
         names = list(COLORS)
         for g, n in zip(*linear_sum_assignment(cost_GN * area_G[:, None]), strict=True):
             if n == cost_GN[g].argmin() or cost_GN[g, n] <= SECOND_CHOICE:
-                width = apparent_width(masks_KHW[groups[g]].any(0), camera)
+                width = apparent_width(np.any(masks_KHW[groups[g]], axis=0), camera)
                 things[Thing(names[n], "bowl" if width > BOWL_WIDTH else "block")] = tuple(groups[g])
     return Grounding(tuple(background), tuple(arm), things)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
@@ -19,6 +20,8 @@ from planning.progress import goal_reached
 
 if TYPE_CHECKING:
     import gymnasium
+
+    from textocvp.rollout import Rollout
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,7 @@ def run_episode(
     Raises:
         ValueError: if the environment is not in `primitive` control.
     """
-    if env.action_space.shape != (4,):
+    if not isinstance(env.action_space, Box) or env.action_space.shape != (4,):
         raise ValueError(
             "the loop acts by pick-and-place: make the environment with control='primitive' and without "
             f"place_yaw, so that an action has 4 numbers; its action space is {env.action_space}"
@@ -107,7 +110,9 @@ def run_episode(
     goal = Goal.parse(info["instruction"]) if goal is None else goal
     camera = PinholeCamera.from_info(info["camera"])
     controller = Controller(camera)
-    frames, attempts, queue = [rgb[None]], [], []
+    frames: list[NDArray[np.uint8]] = [rgb[None]]
+    attempts: list[Attempt] = []
+    queue: list[tuple[Instruction, Rollout]] = []
     reached, error = False, None
     for _ in range(max_attempts * len(goal.pairs)):
         try:
@@ -116,11 +121,12 @@ def run_episode(
                 queue = list(zip(plan.best.instructions, plan.rollouts, strict=True))
             instruction, rollout = queue.pop(0)
             action = controller.act(rollout, plan.grounding, instruction)
-        except (GroundingError, ValueError) as problem:
-            error = f"{type(problem).__name__}: {problem}"
+        except GroundingError as problem:
+            error = str(problem)
             break
         seen = rgb
-        observation, _, terminated, truncated, info = env.step(action.to_action())
+        within_reach = np.clip(action.to_action(), env.action_space.low, env.action_space.high)
+        observation, _, terminated, truncated, info = env.step(within_reach)
         rgb = observation["rgb"]
         frames.append(_frames(info, rgb))
         reached = _looks_reached(planner, rgb, goal, _grounder(info, camera, privileged))

@@ -126,7 +126,7 @@ class InstructionPlanner:
     score: Score = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))
     judge: Judge = Judge()
     horizon: int = 24
-    stride: int = 2
+    stride: int = 3
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:

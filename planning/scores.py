@@ -77,21 +77,33 @@ def arm_block_distance(arm_NHW: Tensor, block_NHW: Tensor) -> Tensor:
     Returns:
         (...) in pixels, exact: 0 where they overlap, 1 for neighbours, inf where one is empty.
     """
-    lead, (height, width) = arm_NHW.shape[:-2], arm_NHW.shape[-2:]
-    arm_NHW, block_NHW = arm_NHW.reshape(-1, height, width), block_NHW.reshape(-1, height, width)
-    # First the vertical distance to the arm within each column (two running maxima), then, only at the
-    # block's few pixels, the best column: an exact distance transform evaluated where it is needed.
-    rows_H1 = torch.arange(height, dtype=torch.float32)[:, None]
-    far = 4.0 * (height + width)
-    above_NHW = rows_H1 - torch.where(arm_NHW, rows_H1, -far).cummax(1).values
-    below_NHW = torch.where(arm_NHW, rows_H1, far + height).flip(1).cummin(1).values.flip(1) - rows_H1
-    vertical_NHW = torch.minimum(above_NHW, below_NHW)
-    n, y, x = block_NHW.nonzero(as_tuple=True)
-    across_PW = x[:, None].float() - torch.arange(width, dtype=torch.float32)
-    squared_P = (vertical_NHW[n, y].square() + across_PW.square()).amin(1)
-    squared_N = torch.full((len(arm_NHW),), UNSEEN).scatter_reduce(0, n, squared_P, "amin")
-    squared_N[~arm_NHW.flatten(1).any(1)] = UNSEEN
-    return squared_N.sqrt().reshape(lead)
+    lead, size = arm_NHW.shape[:-2], arm_NHW.shape[-2:]
+    arm_NHW, block_NHW = arm_NHW.reshape(-1, *size), block_NHW.reshape(-1, *size)
+    # Two disjoint shapes are nearest to each other at their outlines, which are few pixels.
+    arm_NP2, block_NQ2 = outline_points(arm_NHW, UNSEEN), outline_points(block_NHW, -UNSEEN)
+    gap_N = torch.full((len(arm_NHW),), UNSEEN)
+    if arm_NP2.shape[1] and block_NQ2.shape[1]:
+        rows_NPQ, columns_NPQ = (arm_NP2[:, :, None, i] - block_NQ2[:, None, :, i] for i in (0, 1))
+        gap_N = (rows_NPQ.square_() + columns_NPQ.square_()).flatten(1).amin(1).sqrt()
+    overlap_N = (arm_NHW & block_NHW).flatten(1).any(1)
+    return gap_N.masked_fill(overlap_N, 0.0).reshape(lead)
+
+
+def outline_points(masks_NHW: Tensor, filler: float) -> Tensor:
+    """Rows and columns (N, P, 2) of those pixels of bool masks (N, H, W) that have a neighbour outside.
+
+    P is what the longest outline needs; shorter ones are filled up with `filler`.
+    """
+    inner_NHW = masks_NHW.clone()
+    inner_NHW[:, [0, -1]], inner_NHW[:, :, [0, -1]] = False, False
+    inner_NHW[:, 1:-1, 1:-1] &= masks_NHW[:, 2:, 1:-1] & masks_NHW[:, :-2, 1:-1]
+    inner_NHW[:, 1:-1, 1:-1] &= masks_NHW[:, 1:-1, 2:] & masks_NHW[:, 1:-1, :-2]
+    n, y, x = (masks_NHW & ~inner_NHW).nonzero(as_tuple=True)
+    count_N = torch.bincount(n, minlength=len(masks_NHW))
+    place = torch.arange(len(n)) - (count_N.cumsum(0) - count_N)[n]
+    points_NP2 = torch.full((len(masks_NHW), int(count_N.max()) if len(count_N) else 0, 2), filler)
+    points_NP2[n, place] = torch.stack([y, x], dim=1).float()
+    return points_NP2
 
 
 def centroids(masks_NHW: Tensor) -> Tensor:
@@ -160,14 +172,17 @@ def measure_rollout(
         if len(values) != batch:
             raise ValueError(f"{batch} rollouts need one or {batch} {name}, got {len(values)}")
     frames = tuple(range(length) if frames is None else frames)
-    num_slots = rollout.slots.shape[2]
-    winner_BtHW = rollout.decode_masks(frames).argmax(2).cpu()  # which slot each pixel belongs to
+    masks_BtKHW = rollout.decode_masks(frames).cpu()
+    largest_BtHW = masks_BtKHW.amax(2)
+    rows_B1 = torch.arange(batch)[:, None]
 
     def union(slots_of_B: Sequence[Sequence[int]]) -> Tensor:
-        member_BK = torch.zeros(batch, num_slots, dtype=torch.bool)
-        for b, slots in enumerate(slots_of_B):
-            member_BK[b, list(slots)] = True
-        return member_BK.gather(1, winner_BtHW.flatten(1)).view_as(winner_BtHW)
+        """The pixels (B, t, H, W) that some of a rollout's given slots win."""
+        most = max(1, *(len(slots) for slots in slots_of_B))
+        index_Bn = torch.tensor([[*slots, *[-1] * (most - len(slots))] for slots in slots_of_B])
+        share_BntHW = masks_BtKHW[rows_B1, :, index_Bn]
+        share_BntHW[index_Bn < 0] = -1.0  # a thing may have fewer slots than another, or none
+        return share_BntHW.amax(1) == largest_BtHW
 
     both = list(zip(each_grounding, each_instruction, strict=True))
     return measure(

@@ -54,7 +54,7 @@ class SequencePlanner:
     score: Score = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))
     judge: Judge = Judge()
     horizon: int = 24
-    stride: int = 2
+    stride: int = 3
     beam: int = 4
     seed: int = 0
 
@@ -64,7 +64,8 @@ class SequencePlanner:
         parsed = self.world_model.parse(rgb[None], seed=self.seed)
         grounding = grounder(parsed).told(goal.things)
         pairs = open_pairs(parsed, grounding, goal) or goal.pairs
-        kept, dropped, starts = [_Branch()], [], parsed
+        kept, starts = [_Branch()], parsed
+        dropped: list[_Branch] = []
         for _ in pairs:
             grown, rollout = self._grow(kept, starts, grounding, pairs)
             grown.sort(key=lambda branch: branch.score, reverse=True)

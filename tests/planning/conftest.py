@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import torch
 
 from envs.camera import PRESETS, Camera
 from planning import PinholeCamera
 from tests.planning.oracle import OracleWorldModel
+
+torch.set_num_threads(1)  # tiny tensors: more threads only wait for each other
 
 
 def thing(kind: str, color: str, x: float, y: float) -> dict[str, Any]:

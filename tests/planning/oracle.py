@@ -1,7 +1,8 @@
 """A test double for the world model: it imagines by geometry, from the simulator's own object poses.
 
-It cheats on purpose (it is given the true scene), so that planners, controller and loop can be tested without a
-trained checkpoint. Its rollouts are real `Rollout` objects whose masks are drawn from slots by `ShapeRenderer`.
+It cheats on purpose (it is given the true scene), so that planners, controller and loop can be tested without
+a trained checkpoint. Its rollouts are real `Rollout` objects whose masks are drawn from slots by
+`ShapeRenderer`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,11 @@ class ShapeRenderer(Renderer):
         masks_BKHW = self.masks(slots_BKD)
         colors_BK3 = slots_BKD[..., 4:7]
         frames_B3HW = torch.einsum("bkhw,bkc->bchw", masks_BKHW, colors_BK3)
-        return Rendered(frames_B3HW, masks_BKHW, colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size))
+        return Rendered(
+            frames_B3HW,
+            masks_BKHW,
+            colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size),
+        )
 
     def masks(self, slots_BKD: Tensor) -> Tensor:
         layer_BK11 = slots_BKD[..., 3, None, None]
@@ -47,7 +52,9 @@ class ShapeRenderer(Renderer):
         x_BKHW = (line[None, :] - center_BK2[..., 0, None, None]).expand(-1, -1, self.size, -1)
         y_BKHW = (line[:, None] - center_BK2[..., 1, None, None]).expand(-1, -1, -1, self.size)
         sx, sy = spread_BK2[..., 0, None, None], spread_BK2[..., 1, None, None]
-        ellipse = (x_BKHW / (2 * sx)) ** 2 + (y_BKHW / (2 * sy)) ** 2 <= 1  # a disc's edge lies 2 deviations out
+        ellipse = (x_BKHW / (2 * sx)) ** 2 + (
+            y_BKHW / (2 * sy)
+        ) ** 2 <= 1  # a disc's edge lies 2 deviations out
         box = (x_BKHW.abs() <= 3**0.5 * sx) & (y_BKHW.abs() <= 3**0.5 * sy)  # a box's, sqrt(3)
         beam = (x_BKHW.abs() <= 2) & (y_BKHW <= 0)
         inside = torch.where(layer_BK11 == BOWL, ellipse, torch.where(layer_BK11 == BLOCK, box, beam))
@@ -80,17 +87,22 @@ class OracleWorldModel:
         for item in self.objects():
             layer = BLOCK if item["kind"] == "block" else BOWL
             position = np.asarray(item["position"], dtype=float)
-            middle = position if layer == BLOCK else position + [0, 0, BOWL_HEIGHT / 2]
+            middle = position if layer == BLOCK else position + np.array([0, 0, BOWL_HEIGHT / 2])
             slots.append(self._slot(layer, middle, 0.92 * np.array(COLORS[item["color"]])))
         slots += [self._slot(BLOCK, [0.5, 0, 0], (0.5, 0.5, 0.5), presence=0.0)] * self.spare_slots
-        order = np.random.default_rng(seed).permutation(len(slots) - 1) + 1  # the slot's number must not matter
+        order = (
+            np.random.default_rng(seed).permutation(len(slots) - 1) + 1
+        )  # the slot's number must not matter
         slots_KD = torch.stack([slots[0], *(slots[i] for i in order)])
         return self._rollout(slots_KD[None, None], ())
 
     def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         self.calls.append(len(text))
         starts_BKD = obs.slots[:, -1].expand(len(text), -1, -1)
-        films = [self._imagine(start, Instruction.parse(t), horizon) for start, t in zip(starts_BKD, text, strict=True)]
+        films = [
+            self._imagine(start, Instruction.parse(t), horizon)
+            for start, t in zip(starts_BKD, text, strict=True)
+        ]
         return self._rollout(torch.stack(films), tuple(text))
 
     def _imagine(self, start_KD: Tensor, instruction: Instruction, horizon: int) -> Tensor:
@@ -100,15 +112,15 @@ class OracleWorldModel:
         pick, place = start_KD[block, :3].double().numpy(), start_KD[bowl, :3].double().numpy()
         place = np.array([*place[:2], 0.006 + BLOCK_SIZE / 2])
         up, top = np.array([0, 0, 0.15]), np.array([0, 0, BLOCK_SIZE / 2 + 0.01])
-        tip = _path([HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1)
+        tip_T3 = _path(
+            [HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1
+        )
         film_TKD = start_KD[None].repeat(horizon + 1, 1, 1)
-        for t in range(1, horizon + 1):
-            share = t / horizon
-            film_TKD[t, arm] = self._slot(ARM, tip[t], ROBOT_COLOR)
-            if instruction.block in self.hands_off:
-                continue
-            at = pick if share < 2 / 7 else place if share > 5 / 7 else tip[t] - top
-            film_TKD[t, block] = self._slot(BLOCK, at, 0.92 * np.array(COLORS[instruction.block]))
+        film_TKD[1:, arm] = self._slots(ARM, tip_T3[1:], ROBOT_COLOR)
+        if instruction.block not in self.hands_off:
+            share_T1 = np.linspace(0, 1, horizon + 1)[:, None]
+            at_T3 = np.where(share_T1 < 2 / 7, pick, np.where(share_T1 > 5 / 7, place, tip_T3 - top))
+            film_TKD[1:, block] = self._slots(BLOCK, at_T3[1:], 0.92 * np.array(COLORS[instruction.block]))
         return film_TKD
 
     def _find(self, slots_KD: Tensor, layer: float, color: str | None) -> int:
@@ -119,16 +131,21 @@ class OracleWorldModel:
                     return k
         raise AssertionError(f"the oracle's scene has no {color} thing of layer {layer}")
 
-    def _slot(self, layer: float, position: Sequence[float] | np.ndarray, color: Any, presence: float = 1.0) -> Tensor:
-        position = np.asarray(position, dtype=float)
-        x, y = self.camera.project(position)
-        pixel = float(self.camera.metres_per_pixel([x, y], 0.03))
-        width, height = {
-            BLOCK: (BLOCK_SIZE / 12**0.5, BLOCK_SIZE / 12**0.5 * 1.2),
-            BOWL: (BOWL_RADIUS / 2, BOWL_RADIUS / 2 * 0.85),
-        }.get(layer, (0.05, 0.05))
-        numbers = [*position, layer, *(2 * np.asarray(color) - 1), x / 32 - 1, y / 32 - 1]
-        return torch.tensor([*numbers, width / pixel / 32, height / pixel / 32, presence], dtype=torch.float32)
+    def _slot(self, layer: float, position: Any, color: Any, presence: float = 1.0) -> Tensor:
+        return self._slots(layer, np.asarray(position, dtype=float)[None], color, presence)[0]
+
+    def _slots(self, layer: float, position_T3: np.ndarray, color: Any, presence: float = 1.0) -> Tensor:
+        """The slots (T, D) of one thing along a path."""
+        pixel_T2 = self.camera.project(position_T3)
+        unit_T1 = self.camera.metres_per_pixel(pixel_T2, 0.03)[:, None] * 32
+        spread_2 = {
+            BLOCK: np.array([1, 1.2]) * BLOCK_SIZE / 12**0.5,
+            BOWL: np.array([1, 0.85]) * BOWL_RADIUS / 2,
+        }.get(layer, np.array([0.05, 0.05]))
+        same_TC = np.tile([layer, *(2 * np.asarray(color) - 1)], (len(position_T3), 1))
+        presence_T1 = np.full((len(position_T3), 1), presence)
+        parts = [position_T3, same_TC, pixel_T2 / 32 - 1, spread_2 / unit_T1, presence_T1]
+        return torch.from_numpy(np.concatenate(parts, axis=1)).float()
 
     def _rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...]) -> Rollout:
         return Rollout(slots_BTKD, texts, (64, 64), LAYOUT, self.renderer)

@@ -18,7 +18,9 @@ def test_agrees_with_the_environments_camera(preset: str) -> None:
 
 def test_metres_per_pixel_is_the_width_of_a_pixel(camera: PinholeCamera) -> None:
     left, right = camera.unproject_to_plane([[31.5, 30.0], [32.5, 30.0]], 0.03)
-    assert camera.metres_per_pixel([32.0, 30.0], 0.03) == pytest.approx(np.linalg.norm(right - left), rel=1e-6)
+    assert camera.metres_per_pixel([32.0, 30.0], 0.03) == pytest.approx(
+        np.linalg.norm(right - left), rel=1e-6
+    )
 
 
 def test_a_ray_that_misses_the_plane_is_an_error(camera: PinholeCamera) -> None:

@@ -9,7 +9,10 @@ def test_instruction_text_round_trip() -> None:
     assert Instruction.parse(instruction.text) == instruction
 
 
-@pytest.mark.parametrize("text", ["", "push the red block", "put the red block in the blue bowl and the green block in the gray bowl"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "push the red block", "put the red block in the blue bowl and the green block in the gray bowl"],
+)
 def test_instruction_wants_exactly_one_pair(text: str) -> None:
     with pytest.raises(ValueError, match="expected one"):
         Instruction.parse(text)
@@ -18,7 +21,12 @@ def test_instruction_wants_exactly_one_pair(text: str) -> None:
 def test_goal_of_the_environments_grammar() -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
     assert goal.pairs == (Instruction("red", "blue"), Instruction("green", "gray"))
-    assert goal.things == (Thing("red", "block"), Thing("blue", "bowl"), Thing("green", "block"), Thing("gray", "bowl"))
+    assert goal.things == (
+        Thing("red", "block"),
+        Thing("blue", "bowl"),
+        Thing("green", "block"),
+        Thing("gray", "bowl"),
+    )
 
 
 def test_goal_is_checked() -> None:

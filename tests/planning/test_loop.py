@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 import envs  # noqa: F401  (registers the environments)
-from planning import Goal, Instruction, InstructionPlanner, PinholeCamera, RandomPlanner, SequencePlanner, run_episode
+from planning import (
+    Goal,
+    Instruction,
+    InstructionPlanner,
+    PinholeCamera,
+    RandomPlanner,
+    SequencePlanner,
+    run_episode,
+)
 from tests.planning.oracle import OracleWorldModel
 
 
@@ -77,7 +85,9 @@ def test_a_variant_of_a_scene_is_judged_by_its_own_instruction(env: gym.Env[Any,
     block = next(item["color"] for item in items if item["kind"] == "block")
     for bowl in (item["color"] for item in items if item["kind"] == "bowl"):
         variant = Instruction(block, bowl)
-        result = run_episode(env, InstructionPlanner(oracle), seed=3, options=options | {"instruction": variant.text})
+        result = run_episode(
+            env, InstructionPlanner(oracle), seed=3, options=options | {"instruction": variant.text}
+        )
         assert result.success and result.attempts[0].instruction == variant
 
 
@@ -102,7 +112,9 @@ def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:
 
 def test_what_cannot_be_grounded_ends_the_episode_with_a_reason(env: gym.Env[Any, Any]) -> None:
     planner = InstructionPlanner(oracle_for(env, 0))
-    missing = next(color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env)))
+    missing = next(
+        color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env))
+    )
     result = run_episode(env, planner, Goal((Instruction(missing, missing),)), seed=0)
     assert not result.success and result.steps == 0
     assert result.error is not None and f"no {missing} block" in result.error

@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from planning import AppearanceGrounder, Controller, Goal, GroundingError, Instruction, InstructionPlanner, RandomPlanner, SequencePlanner
+from planning import (
+    AppearanceGrounder,
+    Controller,
+    Goal,
+    GroundingError,
+    Instruction,
+    InstructionPlanner,
+    RandomPlanner,
+    SequencePlanner,
+)
 from tests.planning.oracle import OracleWorldModel
 
 RGB = np.zeros((64, 64, 3), np.uint8)
@@ -21,7 +30,9 @@ def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, camera, blo
 
 def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera) -> None:
     oracle = OracleWorldModel(lambda: objects, camera, hands_off=["red"])
-    plan = InstructionPlanner(oracle).plan(RGB, Goal.parse("put the red block in the blue bowl"), AppearanceGrounder(camera))
+    plan = InstructionPlanner(oracle).plan(
+        RGB, Goal.parse("put the red block in the blue bowl"), AppearanceGrounder(camera)
+    )
     assert not any(candidate.reaches_goal for candidate in plan.ranking)
 
 
@@ -66,7 +77,9 @@ def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, c
 
 
 def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera) -> None:
-    plan = InstructionPlanner(oracle).plan(RGB, Goal.parse("put the red block in the gray bowl"), AppearanceGrounder(camera))
+    plan = InstructionPlanner(oracle).plan(
+        RGB, Goal.parse("put the red block in the gray bowl"), AppearanceGrounder(camera)
+    )
     action = Controller(camera).act(plan.rollout, plan.grounding, plan.instruction)
     np.testing.assert_allclose(action.pick, (0.45, -0.12), atol=0.01)
     np.testing.assert_allclose(action.place, (0.42, 0.08), atol=0.01)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -68,13 +70,19 @@ def test_judge_wants_both_the_carry_and_the_placement() -> None:
 
 
 def test_scores_rank_nearer_and_longer_higher() -> None:
-    near, far, lost = ([9.0] * 4, [9, 9, 1, 1]), ([9.0] * 4, [9, 9, 6, 6]), ([9.0] * 4, [9, 9, float("inf"), 9])
+    near, far, lost = (
+        ([9.0] * 4, [9, 9, 1, 1]),
+        ([9.0] * 4, [9, 9, 6, 6]),
+        ([9.0] * 4, [9, 9, float("inf"), 9]),
+    )
     place = PlacementScore(LIMITS)
     assert place(trace(*near)) > 0 > place(trace(*far)) > place(trace(*lost))
     assert torch.isfinite(place(trace(*lost))).all()
     carry = CarryScore(LIMITS)
     assert [carry(trace(arm, [0.0] * 5)).item() for arm in ([9.0] * 5, [9, 1, 9, 9, 9.0], [1.0] * 5)] == [
-        pytest.approx(0), pytest.approx(1 / 3), pytest.approx(1)
+        pytest.approx(0),
+        pytest.approx(1 / 3),
+        pytest.approx(1),
     ]
     both = WeightedSum((place, carry), (3.0, 1.0))
     assert both(trace(*near)).item() == pytest.approx(0.75 * 0.75)
@@ -113,3 +121,11 @@ def test_judge_tells_the_instruction_from_every_other(oracle: OracleWorldModel, 
         measure_rollout(rollout, [grounding] * 2, instructions)
     with pytest.raises(LookupError, match="no pink block"):
         measure_rollout(rollout, grounding, Instruction("pink", "blue"))
+
+
+def test_a_robot_out_of_sight_holds_nothing(oracle: OracleWorldModel, camera) -> None:
+    parsed = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
+    grounding = ground(parsed, camera)[0]
+    rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions])
+    armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions)
+    assert torch.isinf(armless.arm_block_Bt).all() and not Judge()(armless).any()
