@@ -55,7 +55,7 @@ class Controller:
 
         Raises:
             GroundingError: if the block is not in the grounding.
-            ValueError: if it ends outside the camera's view of the table.
+            ValueError: if the camera's ray through one of the points does not meet the table.
         """
         slots = list(grounding.find(instruction.block_thing))
         start, end = (slot_center(rollout, slots, frame) for frame in (0, rollout.slots.shape[1] - 1))

@@ -49,8 +49,7 @@ TABLE_COLOR = (47 / 255, 47 / 255, 47 / 255)
 #: A surface shows its colour times the light on it, which lies between these in the tabletop scenes.
 LIGHT = (0.7, 1.05)
 
-#: At most this far (Euclidean, RGB 0..1) may a slot be from a colour that is not its nearest, to get its
-#: name.
+#: To get a name that is not its nearest, a slot may be at most this far from it (Euclidean, RGB 0..1).
 SECOND_CHOICE = 0.25
 
 #: A slot must be present this much, and win this many pixels, to be looked at.
@@ -59,8 +58,8 @@ MIN_PRESENCE, MIN_PIXELS = 0.5, 6
 #: Slots of one colour name belong to one object when their pixels are at most this far apart.
 TOUCH_PX = 2
 
-#: What looks wider than this, in metres, is a bowl. On the first frames of 200 val episodes blocks look 0.054 to 0.076
-#: wide and bowls 0.115 to 0.147 (experiments/calibrate.py).
+#: What looks wider than this, in metres, is a bowl. In the first and last frames of 200 val episodes blocks look
+#: 0.054 to 0.076 wide and bowls 0.115 to 0.149 (`experiments/calibrate.py`).
 BOWL_WIDTH = 0.095
 
 #: Height above the table, in metres, at which apparent sizes are measured.

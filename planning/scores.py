@@ -53,8 +53,7 @@ class Trace:
         return Trace(self.frames, self.arm_block_Bt[keep], self.block_bowl_Bt[keep])
 
     def held(self, within: float) -> Tensor:
-        """The longest unbroken run of frames with the arm at most `within` pixels from the block, (B,) in
-        frames.
+        """The longest unbroken run with the arm at most `within` pixels from the block, (B,) in frames.
 
         Between two looked-at neighbours that both hold, the frames skipped are taken to hold as well.
         """
@@ -117,9 +116,7 @@ def centroids(masks_NHW: Tensor) -> Tensor:
 
 
 def block_bowl_distance(block_NHW: Tensor, bowl_NHW: Tensor) -> Tensor:
-    """Distance between the centroids of two bool masks (..., H, W), in pixels; inf where one is empty:
-    (...).
-    """
+    """Distance (...) between the centroids of two bool masks (..., H, W), in pixels; inf if one is empty."""
     return (centroids(block_NHW) - centroids(bowl_NHW)).norm(dim=-1).nan_to_num(nan=UNSEEN)
 
 
@@ -153,8 +150,7 @@ def measure_rollout(
     *,
     frames: Sequence[int] | None = None,
 ) -> Trace:
-    """The trace of a batch of rollouts, each with respect to one instruction (not necessarily the one
-    imagined).
+    """The trace of a batch of rollouts, each for one instruction (not necessarily the one imagined).
 
     Args:
         groundings: which slot is what; one for all B rollouts, or one each.

@@ -34,11 +34,11 @@ class _Branch:
 
 @dataclass
 class SequencePlanner:
-    """Beam search over sequences of instructions; each step is imagined from where the last imagined one
-    ended.
+    """Beam search over sequences of instructions.
 
-    A step moves one of the blocks that the goal names into any bowl of the scene. A sequence is worth the
-    mean, over the goal's open pairs, of the score of its whole imagined course.
+    Each step is imagined from where the last imagined one ended. A step moves one of the blocks that the goal
+    names into any bowl of the scene. A sequence is worth the mean, over the goal's open pairs, of the score
+    of its whole imagined course.
 
     Attributes:
         world_model: imagines.
