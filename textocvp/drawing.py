@@ -112,7 +112,8 @@ def _screen(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
     """
     if len(captions) == 1:
         factor = max(1, READABLE // pictures.shape[2])
-        names = ("real", "imagined", "slots")[-pictures.shape[1] :]
+        # Without a text nothing was imagined: the frames are true ones, drawn again from their slots.
+        names = ("real", "imagined" if captions[0] else "redrawn", "slots")[-pictures.shape[1] :]
         panels = [_captioned(_framed(enlarge(p, factor)), n) for p, n in zip(pictures[0], names, strict=True)]
         return _captioned(_beside(panels), captions[0])
     factor = max(1, READABLE // 2 // pictures.shape[2])
