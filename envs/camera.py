@@ -51,10 +51,15 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy."""
+        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy.
+
+        PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured:
+        masks sit half a pixel right and up of the projected bodies, at any image size), hence the halves in
+        cx and cy.
+        """
         half = self.size / 2
         fy = half / tan(radians(self.preset.fov) / 2)
-        return np.array([[fy / self.preset.aspect, 0, half], [0, fy, half], [0, 0, 1]])
+        return np.array([[fy / self.preset.aspect, 0, half + 0.5], [0, fy, half - 0.5], [0, 0, 1]])
 
     @property
     def extrinsics(self) -> NDArray[np.float64]:

@@ -47,7 +47,7 @@ def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -
             waiting.append(piece)
             # At least doubling bounds the copying by the size of the final file.
             if stop == episodes or stop - done >= max(EPISODES_PER_MERGE, done):
-                merge(out, config, waiting)
+                merge(out, config, waiting, workshop=parts)
                 for merged in waiting:
                     merged.unlink()
                 waiting, done = [], stop

@@ -14,7 +14,7 @@ from envs.scene import MAX_OBJECTS, ObjectSpec, Scene, find_goal
 
 MAX_BOWLS = 5
 MAX_TRIES = 5000
-"""Whole layouts to try. The fullest allowed scene needs about 20."""
+"""Whole layouts to try. The fullest allowed scene needs about 100 (at most 516 in 60 seeds), at 0.3 ms each."""
 
 ARM_JITTER = 0.08
 """Half-width in radians of the random joint offsets of a perturbed start pose."""

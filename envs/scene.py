@@ -145,8 +145,8 @@ def _find_insides(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
             if hypot(item.x - other.x, item.y - other.y) < needed:
                 raise ValueError(
                     f"the {item.name} and the {other.name} overlap; their centres must be at least "
-                    f"{needed:.3f} m apart, or a block within {inside_radius(sizes):.3f} m of a bowl's centre "
-                    "to lie in it"
+                    f"{needed:.3f} m apart, or a block within {inside_radius(sizes):.3f} m of a bowl's "
+                    "centre to lie in it"
                 )
     return placed
 

@@ -29,20 +29,20 @@ FRAMES_PER_CHUNK = 4
 
 def write_episodes(path: Path, config: EpisodeConfig, episodes: Sequence[RecordedEpisode]) -> None:
     """Write a complete file; it appears under its name only when it is whole."""
-    part = _part(path)
+    part = _part(path, path.parent)
     with h5py.File(part, "w") as file:
         _create(file, config)
         _append(file, {name: _column(name, episodes) for name in _FRAME_FIELDS}, _index(episodes))
     _publish(part, path)
 
 
-def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path]) -> None:
+def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
     """Append the files ``pieces`` to ``path`` (created if missing).
 
-    The longer file is made beside the old one and then takes its name, so ``path`` opens at any moment, also
-    after the process is killed.
+    The longer file is made in the folder ``workshop`` (on the same disk) and then takes the name, so ``path``
+    opens at any moment, also after the process is killed.
     """
-    part = _part(path)
+    part = _part(path, workshop)
     if path.exists():
         shutil.copyfile(path, part)
     with h5py.File(part, "a") as file:
@@ -185,9 +185,9 @@ def _config_json(config: EpisodeConfig) -> str:
     return json.dumps(asdict(config))
 
 
-def _part(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.with_name(f".{path.name}.{os.getpid()}.part")
+def _part(path: Path, folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / f"{path.name}.{os.getpid()}.part"
 
 
 def _publish(part: Path, path: Path) -> None:

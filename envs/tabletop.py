@@ -73,7 +73,7 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
         camera: "close" (the workspace fills the frame) or "paper" (the camera of the paper's frames).
-        object_scale: scales blocks and bowls.
+        object_scale: scales blocks and bowls, 0.5 to 1; at 1 they are the paper's, and 8 of them just fit.
         render_stride: physics steps between two camera frames.
         physics_hz: physics steps per second.
         max_steps: steps until truncation; by default 3 primitives or 75 frames for each goal pair.
@@ -111,7 +111,7 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         for extra in extras:
             check_choice("extras", extra, EXTRAS)
         check_range("image_size", image_size, 16, 2048, whole=True)
-        check_range("object_scale", object_scale, 0.5, 1.1)
+        check_range("object_scale", object_scale, 0.5, 1.0)
         check_range("physics_hz", physics_hz, 120, 2000, whole=True)
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
         if max_steps is not None:
