@@ -71,12 +71,15 @@ class Thing:
     Attributes:
         kind, color: as captions name it.
         place: centroid (x, y) of what is seen of it, -1..1; NaN if it is hidden.
+        size: standard deviation (x, y) of it, same unit. A block lies in the middle of its bowl, and only its size
+            tells the two apart.
         named: whether the episode's instruction names it.
     """
 
     kind: str
     color: str
     place: tuple[float, float]
+    size: tuple[float, float]
     named: bool
 
 
@@ -106,8 +109,9 @@ def things_of(episode: Episode) -> list[Thing]:
     things = []
     for item in episode.objects:
         mask_HW = labels_HW == 2 + item.id
-        x, y = grid_HW2[mask_HW].mean(axis=0) if mask_HW.any() else (math.nan, math.nan)
-        things.append(Thing(item.kind, item.color, (float(x), float(y)), item.id in episode.target))
+        seen_N2 = grid_HW2[mask_HW] if mask_HW.any() else np.full((1, 2), math.nan)
+        (x, y), (wide, high) = seen_N2.mean(axis=0).tolist(), seen_N2.std(axis=0).tolist()
+        things.append(Thing(item.kind, item.color, (x, y), (wide, high), item.id in episode.target))
     return things
 
 
@@ -132,10 +136,10 @@ def ask(things: Sequence[Thing], slots_KD: Tensor, layout: SlotLayout, rng: np.r
     is_thing_K = (state.presence[:, 0] >= 0.5) & (state.presence[:, 0] < 1.5)
 
     def slot(thing: Thing) -> int:
-        distance_K = (
-            (state.position - torch.tensor(thing.place)).norm(dim=-1).masked_fill(~is_thing_K, math.inf)
-        )
-        return int(distance_K.argmin()) if float(distance_K.min()) < MATCHED else -1
+        off_K = (state.position - torch.tensor(thing.place)).norm(dim=-1)
+        other_size_K = (state.scale - torch.tensor(thing.size)).norm(dim=-1)
+        cost_K = (off_K + other_size_K).masked_fill(~is_thing_K | ~(off_K < MATCHED), math.inf)
+        return int(cost_K.argmin()) if cost_K.isfinite().any() else -1
 
     def sentence(block: Thing, bowl: Thing) -> str:
         return f"put the {block.color} block in the {bowl.color} bowl"

@@ -50,6 +50,8 @@ class PredictorTraining:
     """Held-out episodes, for the figures."""
     out: Path
     """Folder of the run. If it holds an unfinished run, that run goes on."""
+    episodes: int | None = None
+    """Train on the first so many episodes of the file only."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
     window: int | None = None
@@ -150,7 +152,7 @@ def train(args: PredictorTraining) -> Following | None:
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
     model = assemble(args).to(accelerator.device)
-    with EpisodeFile(args.data) as episodes, EpisodeFile(args.val) as held_out:
+    with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
         with accelerator.main_process_first():
             cache = cached_slots(model, episodes, args.out / "slots-train.h5")
             val_cache = cached_slots(model, held_out, args.out / "slots-val.h5")

@@ -249,9 +249,9 @@ def test_following_asks_and_judges():
     slots = scenes().padded(6).float()[:1]
     place = SlotState.split(slots[0, 0], LAYOUT).position
     things = [
-        Thing("block", "red", tuple(place[1].tolist()), True),
-        Thing("bowl", "blue", tuple(place[2].tolist()), True),
-        Thing("bowl", "green", tuple(place[3].tolist()), False),
+        Thing("block", "red", tuple(place[1].tolist()), (0.1, 0.1), True),
+        Thing("bowl", "blue", tuple(place[2].tolist()), (0.1, 0.1), True),
+        Thing("bowl", "green", tuple(place[3].tolist()), (0.1, 0.1), False),
     ]
     question = ask(things, slots[0, 0], LAYOUT, np.random.default_rng(0))
     assert (question.block, question.bowl, question.other_bowl) == (1, 2, 3)
@@ -270,6 +270,20 @@ def test_following_asks_and_judges():
     assert (nobody.original, nobody.grounded) == (0, 0)
 
 
+def test_a_block_in_a_bowl_is_told_from_the_bowl_by_its_size():
+    slots = scenes().padded(1).float()[0, 0]
+    state = SlotState.split(slots, LAYOUT)
+    state.position[3] = state.position[2]  # views: slots changes too
+    state.scale[2], state.scale[3] = 0.1, 0.04
+    place = tuple(state.position[2].tolist())
+    bowl, block = (
+        Thing("bowl", "blue", place, (0.11, 0.1), True),
+        Thing("block", "red", place, (0.04, 0.04), True),
+    )
+    question = ask([bowl, block], slots, LAYOUT, np.random.default_rng(0))
+    assert (question.block, question.bowl) == (3, 2)
+
+
 def test_things_are_where_the_simulator_saw_them_first(tmp_path):
     with EpisodeFile(write_toy_episodes(tmp_path / "toy.h5", [6])) as episodes:
         things = things_of(episodes.episode(0))
@@ -278,3 +292,4 @@ def test_things_are_where_the_simulator_saw_them_first(tmp_path):
     assert [thing.named for thing in things] == [True, False, True, False]
     y, x = np.argwhere(mask).mean(axis=0) + 0.5
     assert things[2].place == pytest.approx((x / 16 - 1, y / 16 - 1), abs=1e-5)
+    assert things[3].size == pytest.approx((9**2 / 12 - 1 / 12) ** 0.5 / 16 * np.ones(2), abs=0.02)
