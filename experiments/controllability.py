@@ -102,8 +102,8 @@ class Sizes:
         return min(most, self.controls if steps == 1 else (self.controls + 1) // 2)
 
 
-QUICK = Sizes(predicted=8, slot_seeds=1, loop=5, other=3, long=1, controls=2, clips=3)
-DEFAULT = Sizes(predicted=36, slot_seeds=2, loop=30, other=16, long=6, controls=10, clips=3)
+QUICK = Sizes(predicted=12, slot_seeds=1, loop=8, other=4, long=1, controls=3, clips=3)
+DEFAULT = Sizes(predicted=50, slot_seeds=2, loop=40, other=16, long=6, controls=10, clips=3)
 FULL = Sizes(predicted=100, slot_seeds=5, loop=100, other=100, long=100, controls=100, clips=6)
 # Rough seconds of one unit on one core; they only weigh the parts in the progress bar.
 SECONDS = {"predicted study": 2.6, "closed loop": 0.8, "long goals": 5.0, "pictures": 1.5}

@@ -188,7 +188,7 @@ def _png(draw: Callable[[Axes, Theme], None], size: tuple[float, float], theme: 
     axes = canvas.add_subplot(facecolor=theme.page)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    axes.tick_params(colors=theme.ink, labelsize=10, length=0)
+    axes.tick_params(colors=theme.ink, labelsize=10, length=0, pad=7)
     for text in (axes.xaxis.label, axes.yaxis.label):
         text.set_color(theme.ink)
     axes.set_axisbelow(True)

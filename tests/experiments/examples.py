@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from experiments.reporting import (
@@ -38,6 +40,7 @@ def results(quick: bool = False) -> Results:
     )
 
 
+@lru_cache
 def report(quick: bool = False) -> Report:
     """A page with one block of every kind, and text that would break it if it were not escaped."""
     table = Table(
