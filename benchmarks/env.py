@@ -1,4 +1,4 @@
-"""Speed of the environment: ``python benchmarks/env.py``.
+"""Speed of the environment: ``python -m benchmarks.env``.
 
 CPU time of this one process, so that other work on the machine counts as little as possible. Beside our scene
 stands a CLIPort-like one: 480 physics steps a second, and an arm of as many triangles as detailed visual

@@ -55,6 +55,7 @@ class Tabletop:
         self.sizes = sizes
         self.physics_hz = physics_hz
         self._view, self._projection = camera.view_matrix, camera.projection_matrix
+        self._background = _empty_table(camera)
         self.client = _connect(gui)
         self.arm = -1
         self.objects: list[int] = []
@@ -136,21 +137,20 @@ class Tabletop:
         )
         bodies = np.asarray(bodies).reshape(size, size)
         rgb = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[..., :3].copy()
-        # Painted rather than lit: the table is exactly one colour, and a floor that fills the view would cost
-        # 31 ms.
-        rgb[bodies == 0] = TABLE_RGB
-        rgb[bodies == -1] = FLOOR_RGB
         metres = self.camera.depth_in_metres(np.asarray(depth, dtype=np.float32).reshape(size, size))
+        nothing = bodies == -1
+        rgb[nothing] = self._background.rgb[nothing]
+        metres[nothing] = self._background.depth[nothing]
         return Image(rgb, self._label[bodies + 1], metres)
 
     def _add_table(self) -> int:
         half = [(TABLE.x[1] - TABLE.x[0]) / 2, (TABLE.y[1] - TABLE.y[0]) / 2, TABLE_THICKNESS / 2]
         center = [sum(TABLE.x) / 2, sum(TABLE.y) / 2, -TABLE_THICKNESS / 2]
         touch = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
-        look = p.createVisualShape(p.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
-        table = p.createMultiBody(0, touch, look, center, physicsClientId=self.client)
-        assert table == 0, "render() paints body 0 as the table"
-        return table
+        # Without a visual shape PyBullet would draw the contact shape, so the table's look is a speck that it
+        # hides itself in; `_empty_table` paints what is really seen.
+        look = p.createVisualShape(p.GEOM_BOX, halfExtents=[1e-4] * 3, physicsClientId=self.client)
+        return p.createMultiBody(0, touch, look, center, physicsClientId=self.client)
 
     def _add_objects(self, scene: Scene) -> None:
         client, sizes = self.client, self.sizes
@@ -187,6 +187,26 @@ class Tabletop:
         self.blocks = {
             body for body, item in zip(self.objects, scene.objects, strict=True) if item.kind == "block"
         }
+
+
+def _empty_table(camera: Camera) -> Image:
+    """Table and floor without anything on them, as the camera sees them.
+
+    They never change, and drawing a surface that fills the view is most of a frame's cost at 336x336.
+    """
+    size = camera.size
+    v, u = np.mgrid[:size, :size] + 0.5
+    rays = np.linalg.inv(camera.intrinsics) @ np.stack([u.ravel(), v.ravel(), np.ones(size * size)])
+    turn, shift = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
+    eye, rays = -turn.T @ shift, turn.T @ rays
+    # The rays' parts along the optical axis are 1, so the factor that takes one to z = 0 is the depth.
+    depth = -eye[2] / np.minimum(rays[2], -1e-9)
+    x, y = eye[:2, None] + depth * rays[:2]
+    on_table = (TABLE.x[0] <= x) & (x <= TABLE.x[1]) & (TABLE.y[0] <= y) & (y <= TABLE.y[1])
+    rgb = np.where(on_table[:, None], np.array(TABLE_RGB), np.array(FLOOR_RGB)).astype(np.uint8)
+    depth = np.where(on_table, depth, camera.preset.far).astype(np.float32)
+    nothing = np.full((size, size), BACKGROUND, dtype=np.uint8)
+    return Image(rgb.reshape(size, size, 3), nothing, depth.reshape(size, size))
 
 
 def _connect(gui: bool) -> int:

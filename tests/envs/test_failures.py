@@ -105,7 +105,7 @@ def test_a_block_leaning_on_the_rim_is_no_success(make: Make) -> None:
     bowl = position(info, 1)
     body = env.world.objects[0]
     p.resetBasePositionAndOrientation(
-        body, bowl + (0.045, 0, 0.10), [0, 0, 0, 1], physicsClientId=env.world.client
+        body, bowl + np.array((0.045, 0, 0.10)), [0, 0, 0, 1], physicsClientId=env.world.client
     )
     again = env._info()
     assert again["cliport_success"] and not again["is_success"]

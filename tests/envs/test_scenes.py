@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -125,7 +125,7 @@ def test_a_layout_is_built_where_it_says(make: Make) -> None:
     for item, asked in zip(info["objects"], layout, strict=True):
         assert (item["kind"], item["color"]) == (asked["kind"], asked["color"])
         assert item["position"][:2] == pytest.approx(asked["xy"], abs=0.002)
-    x, y, z, w = info["objects"][0]["orientation"]
+    _, _, z, w = info["objects"][0]["orientation"]
     assert 2 * np.arctan2(z, w) == pytest.approx(0.5, abs=0.01)
 
 
@@ -145,7 +145,7 @@ def test_arm_start_poses(make: Make) -> None:
 
 def test_splits_are_disjoint_and_as_described(make: Make) -> None:
     starts = sorted(split.first_seed for split in SPLITS.values())
-    assert all(b - a == SEEDS_PER_SPLIT for a, b in zip(starts, starts[1:], strict=False))
+    assert all(b - a == SEEDS_PER_SPLIT for a, b in pairwise(starts))
     with pytest.raises(ValueError, match="a split has episodes 0 to 9999999"):
         SPLITS["val"].seed(SEEDS_PER_SPLIT)
     env = make()

@@ -113,7 +113,7 @@ def test_wrong_requests_are_refused(path: Path) -> None:
     with EpisodeFile(path) as file:
         with pytest.raises(IndexError, match="has episodes 0 to 3, not 4"):
             file.episode(4)
-        with pytest.raises(ValueError, match="no episode has 26 frames; the longest .* has 25"):
+        with pytest.raises(ValueError, match=r"no episode has 26 frames; the longest .* has 25"):
             file.random_clips(np.random.default_rng(0), 1, 26)
         with pytest.raises(ValueError, match="at least 1, not 0 and 6"):
             file.random_clips(np.random.default_rng(0), 0, 6)
@@ -122,7 +122,7 @@ def test_wrong_requests_are_refused(path: Path) -> None:
 
 
 def test_wrong_files_are_refused(path: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="there is no episode file .*nothing.h5; collect one with"):
+    with pytest.raises(FileNotFoundError, match=r"there is no episode file .*nothing\.h5; collect one with"):
         EpisodeFile(tmp_path / "nothing.h5")
     with pytest.raises(FileNotFoundError):
         EpisodeFile(tmp_path)
@@ -142,7 +142,7 @@ def test_wrong_files_are_refused(path: Path, tmp_path: Path) -> None:
     lost = write_file(tmp_path / "lost.h5")
     with h5py.File(lost, "a") as file:
         del file["episode/seed"]
-    with pytest.raises(ValueError, match="is damaged: .*seed"):
+    with pytest.raises(ValueError, match=r"is damaged: .*seed"):
         EpisodeFile(lost)
     short = write_file(tmp_path / "short.h5")
     with h5py.File(short, "a") as file:
