@@ -116,7 +116,9 @@ class ClusterInitializer(nn.Module):
         for _ in range(self.seeds):
             # Blurred, so that a seed lies inside a region and not on an odd pixel of its edge.
             smooth_BN = F.avg_pool2d(nearest_BN.view(B, 1, H, W), 3, 1, 1, count_include_pad=False).flatten(1)
-            smooth_BN = torch.where(nearest_BN > self.background_distance, smooth_BN, torch.zeros_like(smooth_BN))
+            smooth_BN = torch.where(
+                nearest_BN > self.background_distance, smooth_BN, torch.zeros_like(smooth_BN)
+            )
             value_B1, index_B1 = smooth_BN.max(dim=1, keepdim=True)
             center_B1C = points_BNC.gather(1, index_B1[..., None].expand(-1, -1, C))
             centers.append(center_B1C)
@@ -124,7 +126,9 @@ class ClusterInitializer(nn.Module):
             nearest_BN = torch.minimum(nearest_BN, (points_BNC - center_B1C).square().sum(-1))
         return torch.cat(centers, 1), torch.cat(used, 1)
 
-    def _k_means(self, points_BNC: Tensor, to_background_BN: Tensor, centers_BSC: Tensor, used_BS: Tensor) -> Tensor:
+    def _k_means(
+        self, points_BNC: Tensor, to_background_BN: Tensor, centers_BSC: Tensor, used_BS: Tensor
+    ) -> Tensor:
         S = centers_BSC.shape[1]
         for last in [False] * self.rounds + [True]:
             distance_BNS = squared_distances(points_BNC, centers_BSC)

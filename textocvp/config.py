@@ -161,7 +161,9 @@ def _build(cls: type, data: Mapping[str, Any], path: str) -> Any:
     if unknown:
         raise ValueError(f"{path}: unknown field {unknown[0]!r}; known: {', '.join(names)}")
     values = {
-        key: _build(_NESTED[key], value, f"{path}.{key}") if key in _NESTED and isinstance(value, Mapping) else value
+        key: _build(_NESTED[key], value, f"{path}.{key}")
+        if key in _NESTED and isinstance(value, Mapping)
+        else value
         for key, value in data.items()
     }
     try:
@@ -175,7 +177,14 @@ PRESETS: dict[str, ModelConfig] = {
     "tabletop-small": ModelConfig(
         name="tabletop-small",
         predictor=PredictorConfig(
-            dim=128, layers=4, heads=4, hidden=256, attention="causal", window=24, color_bias=True, feed_forwards=1
+            dim=128,
+            layers=3,
+            heads=4,
+            hidden=256,
+            attention="causal",
+            window=24,
+            color_bias=True,
+            feed_forwards=1,
         ),
     ),
     # The paper's TextOCVP-SAVi at its own sizes (CATER, 64x64).

@@ -76,7 +76,9 @@ class GlimpseRenderer(Renderer):
     def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
         super().__init__()
         if not layout.explicit:
-            raise ValueError("renderer.kind 'glimpse' needs parser.layout.explicit: it draws a slot at its own place")
+            raise ValueError(
+                "renderer.kind 'glimpse' needs parser.layout.explicit: it draws a slot at its own place"
+            )
         self.layout = layout
         self.size = image_size
         self.cells = config.glimpse_size

@@ -89,10 +89,15 @@ class PlacedCorrector(nn.Module):
         )
         self.gru = nn.GRUCell(content, content)
         self.mlp = nn.Sequential(
-            nn.LayerNorm(content), nn.Linear(content, config.hidden), nn.ReLU(), nn.Linear(config.hidden, content)
+            nn.LayerNorm(content),
+            nn.Linear(content, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, content),
         )
 
-    def forward(self, frames: Tensor, state: SlotState, attention: Tensor | None = None) -> tuple[SlotState, Tensor]:
+    def forward(
+        self, frames: Tensor, state: SlotState, attention: Tensor | None = None
+    ) -> tuple[SlotState, Tensor]:
         """The corrected slots and the attention (B, K, H, W) for frames (B, 3, H, W).
 
         Args:
@@ -113,7 +118,9 @@ class PlacedCorrector(nn.Module):
         content = torch.where(seen, content, state.content)
         return SlotState(content, state.color, position, scale, state.presence), attention
 
-    def _glimpses(self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor) -> Tensor:
+    def _glimpses(
+        self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor
+    ) -> Tensor:
         luminance_B1HW = ((frames + 1) / 2).mean(1, keepdim=True)
         own_BK11 = ((color + 1) / 2).mean(-1)[..., None, None]
         shading_BKHW = attention * (luminance_B1HW / own_BK11.clamp_min(0.05) - 1).clamp(-1, 2)
@@ -138,7 +145,12 @@ class PlacedTransition(nn.Module):
         width = 2 * content
         self.inputs = nn.Linear(content + 5, width)
         self.block = nn.TransformerEncoderLayer(
-            width, config.transition_heads, config.transition_hidden, dropout=0.0, batch_first=True, norm_first=True
+            width,
+            config.transition_heads,
+            config.transition_hidden,
+            dropout=0.0,
+            batch_first=True,
+            norm_first=True,
         )
         self.outputs = nn.Linear(width, content + 4)
         nn.init.zeros_(self.outputs.weight)
@@ -168,7 +180,9 @@ class PlacedParser(SceneParser):
         if not config.layout.explicit:
             raise ValueError("parser.corrector 'placed' needs parser.layout.explicit")
         if config.initializer != "cluster":
-            raise ValueError("parser.corrector 'placed' starts from clusters: set parser.initializer to 'cluster'")
+            raise ValueError(
+                "parser.corrector 'placed' starts from clusters: set parser.initializer to 'cluster'"
+            )
         self.config = config
         self.layout = config.layout
         self.initializer = ClusterInitializer()
@@ -205,7 +219,7 @@ class PlacedParser(SceneParser):
         presence = clusters.presence[..., None].clone()
         presence[:, 0] = BACKGROUND
         is_thing = (presence > 0.5) & (presence < 1.5)
-        # The canvas fills the frame, an unused slot sits in its middle: both constant, so that nothing is learned there.
+        # The canvas fills the frame, an unused slot sits in its middle: constants, nothing to learn there.
         position = torch.where(is_thing, position, torch.zeros_like(position))
         scale = torch.where(is_thing, scale, torch.full_like(scale, 0.5))
         content = frames.new_zeros(B, K, self.layout.content)

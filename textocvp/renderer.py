@@ -28,7 +28,7 @@ class Rendered:
 
     @property
     def object_frames_BK3HW(self) -> Tensor:
-        """Each slot drawn alone; the frame is their mask-weighted sum. K times a frame's numbers: made when asked for."""
+        """Each slot drawn alone; the frame is their mask-weighted sum. Made when asked for, being K frames large."""
         return self.draw_objects()
 
 

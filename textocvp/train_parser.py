@@ -154,7 +154,9 @@ def train(args: ParserTraining) -> ParserQuality:
 
 
 @torch.no_grad()
-def draw_samples(model: TextOCVP, episodes: EpisodeFile, chosen: Iterable[int], path: Path, columns: int = 8) -> None:
+def draw_samples(
+    model: TextOCVP, episodes: EpisodeFile, chosen: Iterable[int], path: Path, columns: int = 8
+) -> None:
     """A picture with three rows an episode: frames, frames redrawn from their slots, and the slots' masks."""
     rows = []
     for index in chosen:

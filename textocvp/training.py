@@ -19,7 +19,9 @@ from accelerate import Accelerator
 STEP_FILE = "step.json"
 
 
-def start(out: Path, precision: Literal["no", "bf16", "fp16"], accumulation: int = 1, cpu: bool = False) -> Accelerator:
+def start(
+    out: Path, precision: Literal["no", "bf16", "fp16"], accumulation: int = 1, cpu: bool = False
+) -> Accelerator:
     """An accelerator that logs to `out`/logs. Makes the folder, so that an unwritable one fails before any work."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
     torch.set_flush_denormal(True)  # decaying Adam moments reach denormals, which are slow on CPUs

@@ -41,7 +41,9 @@ def test_every_box_is_one_region_and_the_rest_is_background() -> None:
 def test_lit_and_shaded_side_are_one_thing_but_touching_colors_are_two() -> None:
     shaded = tuple(int(0.85 * value) for value in BLUE)
     frame = paint(
-        (BLUE, slice(20, 30), slice(10, 40)), (shaded, slice(30, 40), slice(10, 40)), (RED, slice(20, 28), slice(40, 50))
+        (BLUE, slice(20, 30), slice(10, 40)),
+        (shaded, slice(30, 40), slice(10, 40)),
+        (RED, slice(20, 28), slice(40, 50)),
     )
     clusters = ClusterInitializer()(frame, 8)
     areas = clusters.masks[0].sum((1, 2))
@@ -61,7 +63,9 @@ def test_the_largest_regions_win_when_slots_are_few() -> None:
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_regions_do_not_depend_on_the_order_of_the_color_channels(order: tuple[int, ...]) -> None:
     frame = paint(*SCENE)
-    assert torch.equal(ClusterInitializer()(frame, 8).masks, ClusterInitializer()(frame[:, list(order)], 8).masks)
+    assert torch.equal(
+        ClusterInitializer()(frame, 8).masks, ClusterInitializer()(frame[:, list(order)], 8).masks
+    )
 
 
 def test_shading_moves_color_features_less_than_another_color_does() -> None:

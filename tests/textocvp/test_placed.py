@@ -18,7 +18,9 @@ def clip(frames: int = 5, step: int = 4) -> torch.Tensor:
     """(1, T, 3, 64, 64): a red box that moves right by `step` pixels a frame and passes below a blue one."""
     video = torch.tensor(DARK, dtype=torch.float32)[:, None, None].expand(frames, 3, 64, 64).clone()
     for t in range(frames):
-        video[t, :, 12:20, 10 + step * t : 18 + step * t] = torch.tensor(RED, dtype=torch.float32)[:, None, None]
+        video[t, :, 12:20, 10 + step * t : 18 + step * t] = torch.tensor(RED, dtype=torch.float32)[
+            :, None, None
+        ]
         video[t, :, 30:46, 20:40] = torch.tensor(BLUE, dtype=torch.float32)[:, None, None]
     return video[None] / 127.5 - 1
 
@@ -36,9 +38,13 @@ def test_a_slot_keeps_its_thing_and_knows_where_it_is() -> None:
     state = SlotState.split(parsed.slots_BTKD, CONFIG.layout)
     columns = (state.position[0, :, 2, 0] + 1) * 32  # slot 1 is the larger, blue box
     torch.testing.assert_close(columns, torch.tensor([14.0, 18, 22, 26, 30]), atol=0.2, rtol=0)
-    torch.testing.assert_close((state.position[0, :, 1] + 1) * 32, torch.tensor([[30.0, 38]]).expand(5, 2), atol=0.2, rtol=0)
+    torch.testing.assert_close(
+        (state.position[0, :, 1] + 1) * 32, torch.tensor([[30.0, 38]]).expand(5, 2), atol=0.2, rtol=0
+    )
     torch.testing.assert_close(state.scale[0, 0, 2] * 32, torch.full((2,), 8 / 12**0.5), atol=0.1, rtol=0)
-    torch.testing.assert_close((state.color[0, 0, 2] + 1) * 127.5, torch.tensor(RED, dtype=torch.float32), atol=1, rtol=0)
+    torch.testing.assert_close(
+        (state.color[0, 0, 2] + 1) * 127.5, torch.tensor(RED, dtype=torch.float32), atol=1, rtol=0
+    )
     assert state.presence[0, 0, :, 0].tolist() == [2, 1, 1, 0, 0, 0]
 
 

@@ -30,7 +30,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setitem(PRESETS, config.name, config)
 
     def arguments(out: str, **changes) -> ParserTraining:
-        settings = dict(preset="tiny-placed", steps=4, batch=3, clip=2, warmup=1, evaluate_every=100) | changes
+        settings = (
+            dict(preset="tiny-placed", steps=4, batch=3, clip=2, warmup=1, evaluate_every=100) | changes
+        )
         return ParserTraining(tmp_path / "train.h5", tmp_path / "val.h5", tmp_path / out, **settings)
 
     return arguments
@@ -55,7 +57,9 @@ def test_a_killed_run_continues_exactly(run, preset, monkeypatch):
     monkeypatch.setattr(module, "save_state", save)
     train(resumed)
 
-    one, other = (TextOCVP.from_pretrained(args.out / "checkpoint").state_dict() for args in (straight, resumed))
+    one, other = (
+        TextOCVP.from_pretrained(args.out / "checkpoint").state_dict() for args in (straight, resumed)
+    )
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
@@ -73,7 +77,13 @@ def test_training_lowers_the_loss_and_leaves_the_second_stage_alone(run):
         old, new = getattr(before, part).state_dict(), getattr(after, part).state_dict()
         assert all(torch.equal(old[name], new[name]) for name in old)
     quality = json.loads((args.out / "quality.json").read_text())
-    assert 0 <= quality["object_miou"]["low"] <= quality["object_miou"]["value"] <= quality["object_miou"]["high"] <= 1
+    assert (
+        0
+        <= quality["object_miou"]["low"]
+        <= quality["object_miou"]["value"]
+        <= quality["object_miou"]["high"]
+        <= 1
+    )
 
 
 def test_only_the_first_episodes_are_used_if_so_asked(run, monkeypatch):
