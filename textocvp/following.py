@@ -175,7 +175,6 @@ class FollowingTest:
     ) -> None:
         self.slots_ETKD, self.questions, self.layout, self.batch = slots_ETKD, list(questions), layout, batch
 
-    @torch.no_grad()
     def measure(self, model: TextOCVP, episodes: int | None = None) -> Following:
         """Imagine the first `episodes` (default: all) and see where the named blocks end."""
         asked = self.questions[:episodes]
@@ -199,6 +198,7 @@ class FollowingTest:
             episodes=len(asked),
         )
 
+    @torch.no_grad()
     def _ends(self, model: TextOCVP, episodes: Sequence[int], sentences: Sequence[str]) -> dict[int, Tensor]:
         """Where the slots of the episodes end, (K, 2) each, when told the sentences."""
         ends: dict[int, Tensor] = {}

@@ -94,17 +94,21 @@ class Predictor(nn.Module):
 
     # ---- rollouts and teacher forcing
 
-    def forward(self, slots_BTKD: Tensor, text: TextTokens) -> Tensor:
+    def forward(self, slots_BTKD: Tensor, text: TextTokens, forgetful_B: Tensor | None = None) -> Tensor:
         """Teacher forced: `out[:, t]` is the prediction for frame t + 1.
 
         In the `window` form every frame sees all T frames, so only `out[:, -1]` is a prediction.
+
+        Args:
+            forgetful_B: sequences in which every frame sees only itself, a handicap for training: the true past gives
+                away where the arm is heading, and without it only the text can tell.
 
         Raises:
             ValueError: if T is more than `config.window`, or the shapes do not fit.
         """
         self._check(slots_BTKD, text, frames=slots_BTKD.shape[1])
         memory = self._remember(text, slots_BTKD[:, -1])
-        slots_BTKD, _ = self._predict(slots_BTKD, memory, newest_only=False)
+        slots_BTKD, _ = self._predict(slots_BTKD, memory, newest_only=False, forgetful_B=forgetful_B)
         return slots_BTKD
 
     def rollout(
@@ -163,7 +167,13 @@ class Predictor(nn.Module):
         return Imagined(slots_BSKD, torch.stack(maps, dim=1) if return_attention else None)
 
     def _predict(
-        self, slots_BTKD: Tensor, memory: _TextMemory, *, newest_only: bool, caches: _Caches | None = None
+        self,
+        slots_BTKD: Tensor,
+        memory: _TextMemory,
+        *,
+        newest_only: bool,
+        caches: _Caches | None = None,
+        forgetful_B: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The next slots after every frame (B, T, K, D), or with `newest_only` after the newest (B, 1, K, D).
 
@@ -174,6 +184,9 @@ class Predictor(nn.Module):
         x_BTKC = self.slot_in(self._features(slots_BTKD)) + self._codes(start, frames)[:, None]
         x_BNC = x_BTKC.flatten(1, 2)
         bias = self._self_bias(slots_BTKD, caches)
+        if forgetful_B is not None:
+            frame_N = torch.arange(frames, device=x_BNC.device).repeat_interleave(slots)
+            bias = bias + NEVER * forgetful_B[:, None, None, None] * (frame_N[:, None] != frame_N)
         maps = []
         for index, layer in enumerate(self.layers):
             cut = newest_only and frames > 1 and index == len(self.layers) - 1

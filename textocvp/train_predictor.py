@@ -52,6 +52,8 @@ class PredictorTraining:
     """Folder of the run. If it holds an unfinished run, that run goes on."""
     episodes: int | None = None
     """Train on the first so many episodes of the file only."""
+    finetune: bool = False
+    """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
     window: int | None = None
@@ -84,6 +86,9 @@ class PredictorTraining:
     """Permute the colour channels of scene and lexicon together."""
     color_jitter: float = 0.03
     """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
+    forgetful: float = 0.0
+    """Share of the episodes whose frames do not see their past (`causal` form), so that only the text tells where
+    the arm is heading."""
     place_jitter: float = 0.01
     """Standard deviation of the noise on the teacher's slot places, in -1..1."""
     image_weight: float = 0.0
@@ -123,7 +128,9 @@ class Dynamics(nn.Module):
         self.text: TextEncoder = model.text
         self.predictor: Predictor = model.predictor
 
-    def forward(self, seen_BTKD: Tensor, words: WordBatch, imagined: int) -> Tensor:
+    def forward(
+        self, seen_BTKD: Tensor, words: WordBatch, imagined: int, forgetful_B: Tensor | None = None
+    ) -> Tensor:
         """Predictions (B, S, K, D), the last of which is of the frame number T + imagined (the first is
         number 0).
 
@@ -136,7 +143,7 @@ class Dynamics(nn.Module):
             with torch.no_grad():
                 dreamt_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
             seen_BTKD = torch.cat([seen_BTKD, dreamt_BSKD], dim=1)
-        return self.predictor(seen_BTKD, text)
+        return self.predictor(seen_BTKD, text, forgetful_B)
 
 
 def train(args: PredictorTraining) -> Following | None:
@@ -176,8 +183,19 @@ def train(args: PredictorTraining) -> Following | None:
 
 
 def assemble(args: PredictorTraining) -> TextOCVP:
-    """A model with the trained parser and renderer, frozen, and a new text encoder and predictor."""
+    """A model with the trained parser and renderer, frozen, and a text encoder and a predictor to train.
+
+    Raises:
+        ValueError: if an option would change the architecture of what is to be fine-tuned.
+    """
     trained = TextOCVP.from_pretrained(args.parser)
+    if args.finetune:
+        for option in ("preset", "window", "color_bias", "text"):
+            if getattr(args, option) is not None:
+                raise ValueError(f"finetune keeps the checkpoint's architecture: leave out {option}")
+        for part in (trained.parser, trained.renderer):
+            part.requires_grad_(False)
+        return trained
     config = trained.config
     if args.preset is not None:
         chosen = preset(args.preset)
@@ -241,7 +259,8 @@ def fit(
         lesson = next_lesson(args, model.config.predictor, step, batches.frames, rng)
         with accelerator.autocast():
             seen_BTKD = batches.noisy(rng, batch.slots_BTKD[:, : lesson.seen])
-            predicted_BSKD = dynamics(seen_BTKD, batch.words, lesson.imagined).float()
+            forgetful_B = torch.from_numpy(rng.random(args.batch) < args.forgetful).to(accelerator.device)
+            predicted_BSKD = dynamics(seen_BTKD, batch.words, lesson.imagined, forgetful_B).float()
         last = lesson.seen + lesson.imagined  # the number of the last frame that was predicted
         first_predicted = last + 1 - predicted_BSKD.shape[1]
         true_BTKD = batch.slots_BTKD[:, first_predicted - 1 : last + 1]

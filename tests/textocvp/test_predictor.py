@@ -85,6 +85,18 @@ def test_causal_frames_do_not_see_the_future():
     assert (before[:, 4:] - after[:, 4:]).abs().max() > 0.1
 
 
+def test_forgetful_sequences_see_one_frame_at_a_time():
+    model, slots = build(), scene(frames=4)
+    changed = slots.clone()
+    changed[:, 1, :, : EXPLICIT.content] += 1.0
+    forgetful = torch.tensor([True, False])
+    with torch.no_grad():
+        before, after = model(slots, text(), forgetful), model(changed, text(), forgetful)
+        torch.testing.assert_close(before[1], model(slots, text())[1])
+    torch.testing.assert_close(before[0, [0, 2, 3]], after[0, [0, 2, 3]])
+    assert (before[1, 2] - after[1, 2]).abs().max() > 1e-3
+
+
 def test_window_frames_see_each_other_but_nothing_older_than_the_window():
     model = build("window", window=3)
     slots = scene(frames=5)
