@@ -48,6 +48,8 @@ class SlotBatches:
         text: looks the sentences up; its weights are not used.
         frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
         recolor: permute the colour channels.
+        color_spread: stretch each colour channel of a scene and of its sentence by up to this, and shift it by up to
+            this, so that colours brighter and darker than the captioned ones are met.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
         place_jitter: standard deviation of the noise of `noisy`, in -1..1.
     """
@@ -60,11 +62,12 @@ class SlotBatches:
         frames: int,
         *,
         recolor: bool,
+        color_spread: float,
         color_jitter: float,
         place_jitter: float,
     ) -> None:
         self.layout, self.recolor = layout, recolor and layout.explicit
-        self.color_jitter, self.place_jitter = color_jitter, place_jitter
+        self.color_spread, self.color_jitter, self.place_jitter = color_spread, color_jitter, place_jitter
         self.frames = frames
         self._slots_ETKD = cache.padded(frames)
         self._words = text.lookup(cache.instructions).to("cpu")
@@ -97,11 +100,17 @@ class SlotBatches:
         # Colour and presence are carried through a rollout: what they are in the first frame they are in all.
         order = channels_B3[:, None, None].expand_as(state.color[:, :1])
         color = state.color[:, :1].gather(-1, order)
+        stretch_B3, shift_B3 = (
+            torch.from_numpy(rng.uniform(-self.color_spread, self.color_spread, (size, 3)).astype(np.float32))
+            for _ in range(2)
+        )
+        color = color + stretch_B3[:, None, None] * color + shift_B3[:, None, None]
         color = (color + _noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
         presence = state.presence[:, :1].expand_as(state.presence)
         slots_BTKD = replace(state, color=color, presence=presence).join()
-        shift = _noise(rng, words.colors_BL3.shape, self.color_jitter) * words.names_color_BL[..., None]
-        words = replace(words, colors_BL3=words.colors_BL3 + shift)
+        colors_BL3 = words.colors_BL3 + stretch_B3[:, None] * words.colors_BL3 + shift_B3[:, None]
+        colors_BL3 = colors_BL3 + _noise(rng, colors_BL3.shape, self.color_jitter)
+        words = replace(words, colors_BL3=colors_BL3 * words.names_color_BL[..., None])
         return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
 
     def noisy(self, rng: np.random.Generator, slots_BTKD: Tensor) -> Tensor:

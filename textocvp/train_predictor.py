@@ -84,6 +84,8 @@ class PredictorTraining:
     """Weight of the error in content."""
     recolor: bool = True
     """Permute the colour channels of scene and lexicon together."""
+    color_spread: float = 0.0
+    """Stretch and shift each colour channel of scene and lexicon alike, by up to this (without image loss)."""
     color_jitter: float = 0.03
     """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
     forgetful: float = 0.0
@@ -170,6 +172,8 @@ def train(args: PredictorTraining) -> Following | None:
             model.text,
             training_frames(model.config, cache),
             recolor=args.recolor,
+            # Drawn frames cannot be recoloured like this.
+            color_spread=args.color_spread if args.image_weight == 0 else 0.0,
             color_jitter=args.color_jitter,
             place_jitter=args.place_jitter,
         )

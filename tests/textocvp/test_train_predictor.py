@@ -47,7 +47,7 @@ def scenes(episodes: int = 12, frames: int = 6, slots: int = 5) -> SlotCache:
 
 
 def batches(**changes) -> SlotBatches:
-    settings = dict(recolor=True, color_jitter=0.0, place_jitter=0.0) | changes
+    settings = dict(recolor=True, color_spread=0.0, color_jitter=0.0, place_jitter=0.0) | changes
     return SlotBatches(scenes(), LAYOUT, build(PLACED).text, 6, **settings)
 
 
@@ -162,6 +162,20 @@ def test_recoloring_permutes_scene_and_words_alike():
         torch.testing.assert_close(after.color[i], before.color[i][..., order])
         torch.testing.assert_close(b.words.colors_BL3[i], a.words.colors_BL3[i][..., order])
     assert torch.equal(after.content, before.content) and torch.equal(after.position, before.position)
+
+
+def test_spread_keeps_the_match_of_slots_and_words():
+    plain, spread = batches(recolor=False), batches(recolor=False, color_spread=0.3)
+    a, b = plain.draw(np.random.default_rng(5), 12), spread.draw(np.random.default_rng(5), 12)
+    before, after = SlotState.split(a.slots_BTKD, LAYOUT).color, SlotState.split(b.slots_BTKD, LAYOUT).color
+    red = a.words.names_color_BL[:, 2]
+    assert red.all() and (b.words.colors_BL3[~b.words.names_color_BL] == 0).all()
+    # One stretch a scene and channel: what differs between slot and word differs alike afterwards.
+    gap_before = before[:, 0, 1] - a.words.colors_BL3[:, 2]
+    ratio = (after[:, 0, 1] - b.words.colors_BL3[:, 2]) / gap_before
+    other = (after[:, 0, 2] - b.words.colors_BL3[:, 2]) / (before[:, 0, 2] - a.words.colors_BL3[:, 2])
+    torch.testing.assert_close(ratio, other, atol=1e-3, rtol=1e-3)
+    assert ratio.min() >= 0.69 and ratio.max() <= 1.31 and ratio.std() > 0.05
 
 
 def test_unused_slots_are_left_out_and_colors_stay_those_of_the_first_frame():
