@@ -62,7 +62,7 @@ class PredictorTraining:
     """Colour-matching term in the text attention, instead of the preset's choice."""
     text: Literal["transformer", "lexicon"] | None = None
     """Text encoder, instead of the preset's choice."""
-    steps: int = 1500
+    steps: int = 1100
     """Updates."""
     batch: int = 32
     """Episodes an update."""
