@@ -103,7 +103,7 @@ class Sizes:
 
 
 QUICK = Sizes(predicted=12, slot_seeds=1, loop=8, other=4, long=1, controls=3, clips=3)
-DEFAULT = Sizes(predicted=50, slot_seeds=2, loop=40, other=16, long=6, controls=10, clips=3)
+DEFAULT = Sizes(predicted=100, slot_seeds=1, loop=60, other=30, long=10, controls=20, clips=3)
 FULL = Sizes(predicted=100, slot_seeds=5, loop=100, other=100, long=100, controls=100, clips=6)
 # Rough seconds of one unit on one core; they only weigh the parts in the progress bar.
 SECONDS = {"predicted study": 2.6, "closed loop": 0.8, "long goals": 5.0, "pictures": 1.5}

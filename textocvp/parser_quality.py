@@ -16,6 +16,9 @@ from textocvp.episodes import EpisodeFile
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.model import TextOCVP
 
+GATES = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
+"""What a parser of the tabletop must reach on held-out episodes before a predictor is worth training on its slots."""
+
 
 @dataclass(frozen=True)
 class ParserQuality:
@@ -41,6 +44,14 @@ class ParserQuality:
     def figures(self) -> dict[str, float]:
         """The values alone, named for a log."""
         return {f"quality/{name}": getattr(self, name).value for name in self.__dataclass_fields__}
+
+    def missed_gates(self) -> list[str]:
+        """A sentence for each figure below its gate; empty for a parser that is good enough."""
+        return [
+            f"{name} is {getattr(self, name).value:.3f}, below its gate of {gate:.2f}"
+            for name, gate in GATES.items()
+            if getattr(self, name).value < gate
+        ]
 
     def to_json(self) -> str:
         """Values, intervals and numbers of episodes."""

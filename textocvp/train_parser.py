@@ -148,6 +148,8 @@ def train(args: ParserTraining) -> ParserQuality:
         accelerator.unwrap_model(model).save_pretrained(args.out / "checkpoint")
         quality = measure_parser(model, held_out, range(len(held_out)))
     print(f"final: {quality}")
+    for sentence in quality.missed_gates():
+        print(f"not good enough to train a predictor on: {sentence}")
     (args.out / "quality.json").write_text(quality.to_json())
     accelerator.end_training()
     return quality

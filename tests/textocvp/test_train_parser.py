@@ -15,8 +15,9 @@ from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.config import PRESETS
 from textocvp.episodes import EpisodeFile
 from textocvp.losses import image_loss, mask_loss, thing_weights
+from textocvp.metrics import Interval
 from textocvp.model import TextOCVP
-from textocvp.parser_quality import measure_parser
+from textocvp.parser_quality import ParserQuality, measure_parser
 from textocvp.renderer import Rendered
 from textocvp.train_parser import ParserTraining, parser_loss, to_frames, train
 
@@ -114,6 +115,16 @@ def test_quality_is_perfect_for_masks_that_are_the_segmentation(run):
             quality = measure_parser(model, episodes, [index], frame_step=1)
             assert quality.object_miou.value == 1 and quality.object_found.value == 1
             assert quality.followed.value == 1 and quality.foreground_ari.value == 1
+
+
+def test_gates_name_what_is_not_good_enough():
+    def quality(miou: float, found: float) -> ParserQuality:
+        figures = [Interval(value, value, value, 1) for value in (miou, found, 0.95, 0.5, 20.0)]
+        return ParserQuality(*figures)
+
+    assert quality(0.80, 0.93).missed_gates() == []
+    assert quality(0.79, 0.93).missed_gates() == ["object_miou is 0.790, below its gate of 0.80"]
+    assert len(quality(0.5, 0.5).missed_gates()) == 2
 
 
 def test_weights_single_out_what_is_not_the_canvas():
