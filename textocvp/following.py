@@ -133,7 +133,7 @@ def ask(things: Sequence[Thing], slots_KD: Tensor, layout: SlotLayout, rng: np.r
         rng: picks the other bowl and the wrong sentence.
     """
     state = SlotState.split(slots_KD, layout)
-    is_thing_K = (state.presence[:, 0] >= 0.5) & (state.presence[:, 0] < 1.5)
+    is_thing_K = state.is_thing[:, 0]
 
     def slot(thing: Thing) -> int:
         off_K = (state.position - torch.tensor(thing.place)).norm(dim=-1)

@@ -61,5 +61,5 @@ def place_loss(expected: SlotState, found: SlotState) -> Tensor:
     """Mean squared error of expected places and log-sizes, over the things; no gradient enters `found`."""
     wanted = torch.cat([found.position, found.scale.log()], dim=-1).detach()
     error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
-    things = (found.presence[..., 0] > 0.5) & (found.presence[..., 0] < 1.5)
+    things = found.is_thing[..., 0]
     return torch.where(things, error, torch.zeros_like(error)).sum() / things.sum().clamp_min(1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -59,6 +60,11 @@ class SceneParser(nn.Module):
                 default.
         """
         raise NotImplementedError
+
+
+def to_frames(clips: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """Clips (B, T, H, W, 3) uint8 as the model's frames (B, T, 3, H, W), float in -1..1."""
+    return torch.from_numpy(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
 
 
 def build_parser(config: ParserConfig) -> SceneParser:

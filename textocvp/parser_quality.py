@@ -15,6 +15,7 @@ import torch
 from textocvp.episodes import EpisodeFile
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.model import TextOCVP
+from textocvp.parser import to_frames
 
 GATES = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
 """What a parser of the tabletop must reach on held-out episodes before a predictor is worth training on its slots."""
@@ -73,7 +74,7 @@ def measure_parser(
     ious, found, follows, aris, psnrs = [], [], [], [], []
     for index in chosen:
         episode = episodes.episode(index)
-        frames = torch.from_numpy(episode.frames).permute(0, 3, 1, 2).float().to(model.device) / 127.5 - 1
+        frames = to_frames(episode.frames[None], model.device)[0]
         slots = model.parser(frames[None]).slots_BTKD[0]
         rendered = model.renderer(slots)
         labels = rendered.masks_BKHW.argmax(1).cpu().numpy()

@@ -105,8 +105,7 @@ class PlacedCorrector(nn.Module):
         """
         if attention is None:
             attention = self.attend(frames, state)
-        is_thing = (state.presence > 0.5) & (state.presence < 1.5)
-        seen = is_thing & (attention.sum((2, 3))[..., None] >= self.min_pixels)
+        seen = state.is_thing & (attention.sum((2, 3))[..., None] >= self.min_pixels)
         position, scale = moments(attention)
         position = torch.where(seen, position, state.position)
         scale = torch.where(seen, scale, state.scale)
@@ -162,7 +161,7 @@ class PlacedTransition(nn.Module):
         unused = state.presence[..., 0] < 0.5
         change = self.outputs(self.block(self.inputs(tokens), src_key_padding_mask=unused))
         content, position, log_scale = change.split([state.content.shape[-1], 2, 2], dim=-1)
-        moves = (state.presence > 0.5) & (state.presence < 1.5)
+        moves = state.is_thing
         return SlotState(
             torch.where(moves, state.content + content, state.content),
             state.color,

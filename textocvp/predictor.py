@@ -235,7 +235,7 @@ class Predictor(nn.Module):
             content = self.content_mean_C + self.content_std_C * content
         moved = SlotState(content, state.color, position, log_scale.exp(), state.presence).join()
         # Unused slots and the canvas (presence 2) stay as they are.
-        return torch.where((state.presence >= 0.5) & (state.presence < 1.5), moved, slots)
+        return torch.where(state.is_thing, moved, slots)
 
     def _present(self, slots: Tensor) -> Tensor:
         """Which slots hold something (..., K), bool."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from textocvp.episodes import EpisodeFile
+from textocvp.parser import to_frames
 from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import TextEncoder, WordBatch
@@ -120,8 +121,7 @@ class SlotBatches:
             return slots_BTKD
         state = SlotState.split(slots_BTKD, self.layout)
         noise = _noise(rng, state.position.shape, self.place_jitter).to(slots_BTKD.device)
-        is_thing = (state.presence >= 0.5) & (state.presence < 1.5)
-        return replace(state, position=state.position + noise * is_thing).join()
+        return replace(state, position=state.position + noise * state.is_thing).join()
 
 
 def _used(slots_BTKD: Tensor) -> Tensor:
@@ -142,5 +142,5 @@ def true_frames(episodes: EpisodeFile, batch: SlotBatch, times_BS: np.ndarray) -
     """The frames (B, S, 3, H, W), -1..1, of these times, recoloured as the batch's slots were."""
     clips = episodes.frames(batch.episodes_B)
     chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]
-    frames_BS3HW = torch.from_numpy(np.stack(chosen)).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
+    frames_BS3HW = to_frames(np.stack(chosen))
     return frames_BS3HW.gather(2, batch.channels_B3[:, None, :, None, None].expand_as(frames_BS3HW))

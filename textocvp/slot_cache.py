@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from textocvp.parser import to_frames
+
 if TYPE_CHECKING:
     from textocvp.episodes import EpisodeFile
     from textocvp.model import TextOCVP
@@ -157,9 +159,7 @@ def _parse(
         longest = max(map(len, read))
         # Parsing is causal: repeating the last frame of the shorter episodes changes nothing before it.
         padded = [clip[np.minimum(np.arange(longest), len(clip) - 1)] for clip in read]
-        frames = (
-            torch.from_numpy(np.stack(padded)).to(model.device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
-        )
+        frames = to_frames(np.stack(padded), model.device)
         # Initialisers that draw at random draw the same again for the same episodes.
         generator = torch.Generator(model.device).manual_seed(first)
         found = model.parser(frames, generator=generator).slots_BTKD.half().cpu().numpy()

@@ -50,6 +50,11 @@ class SlotState:
     scale: Tensor
     presence: Tensor
 
+    @property
+    def is_thing(self) -> Tensor:
+        """(..., 1) bool: neither unused nor the canvas."""
+        return (self.presence >= 0.5) & (self.presence < 1.5)
+
     def join(self) -> Tensor:
         """The slot tensor (..., C + 8)."""
         return torch.cat([self.content, self.color, self.position, self.scale, self.presence], dim=-1)

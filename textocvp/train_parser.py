@@ -26,6 +26,7 @@ from textocvp.drawing import color_masks
 from textocvp.episodes import EpisodeFile
 from textocvp.losses import ParserLoss, image_loss, mask_loss, place_loss, thing_weights
 from textocvp.model import TextOCVP
+from textocvp.parser import to_frames
 from textocvp.parser_quality import ParserQuality, measure_parser
 from textocvp.slots import SlotState
 from textocvp.training import load_state, save_state, start, step_rng
@@ -75,11 +76,6 @@ class ParserTraining:
     """Held-out episodes they are measured on; the final figures use all."""
     save_minutes: float = 4.0
     """Minutes between saved states."""
-
-
-def to_frames(clips: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
-    """Clips (B, T, H, W, 3) uint8 as the model's frames (B, T, 3, H, W), float in -1..1."""
-    return torch.from_numpy(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
 
 
 def parser_loss(model: TextOCVP, frames_BT3HW: Tensor, thing_weight: float) -> ParserLoss:
