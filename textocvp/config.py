@@ -6,9 +6,10 @@ know. Sizes of the published model are from TextOCVP (TMLR 2026), section 4 and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from textocvp.slots import SlotLayout
 
@@ -170,6 +171,49 @@ def _build(cls: type, data: Mapping[str, Any], path: str) -> Any:
         return cls(**values)
     except TypeError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def with_settings(config: ModelConfig, settings: Iterable[str]) -> ModelConfig:
+    """The configuration with some fields changed, each written `part.field=value`.
+
+    For example `predictor.layers=2`, `predictor.residual=false`, `parser.layout.content=32`.
+
+    Raises:
+        ValueError: if a setting is not of that form, the field does not exist, or the value is not allowed; the message
+            says what is.
+    """
+    for setting in settings:
+        path, equals, text = setting.partition("=")
+        if not equals:
+            raise ValueError(f"{setting!r}: write part.field=value, for example predictor.layers=2")
+        config = _changed(config, path.split("."), text, path)
+    return config
+
+
+def _changed(node: Any, names: list[str], text: str, path: str) -> Any:
+    known = [f.name for f in fields(node)]
+    if names[0] not in known:
+        raise ValueError(f"unknown setting {path!r}: no field {names[0]!r}; known: {', '.join(known)}")
+    value = getattr(node, names[0])
+    if len(names) > 1:
+        if names[0] not in _NESTED:
+            raise ValueError(f"unknown setting {path!r}: {names[0]!r} has no fields")
+        return replace(node, **{names[0]: _changed(value, names[1:], text, path)})
+    if names[0] in _NESTED:
+        raise ValueError(f"{path!r} is a group; set one of {', '.join(f.name for f in fields(value))}")
+    try:
+        chosen = json.loads(text)
+    except json.JSONDecodeError:
+        chosen = text
+    kind = get_type_hints(type(node))[names[0]]
+    if get_origin(kind) is Literal:
+        if chosen not in get_args(kind):
+            raise ValueError(f"{path}={text}: must be one of {', '.join(map(str, get_args(kind)))}")
+    elif kind is float and type(chosen) is int:
+        chosen = float(chosen)
+    elif type(chosen) is not kind:
+        raise ValueError(f"{path}={text}: must be a value of type {kind.__name__}")
+    return replace(node, **{names[0]: chosen})
 
 
 PRESETS: dict[str, ModelConfig] = {

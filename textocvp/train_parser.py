@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.config import preset
+from textocvp.config import preset, with_settings
 from textocvp.drawing import color_masks
 from textocvp.episodes import EpisodeFile
 from textocvp.losses import ParserLoss, image_loss, mask_loss, place_loss, thing_weights
@@ -44,6 +44,8 @@ class ParserTraining:
     """Folder of the run. If it holds an unfinished run, that run goes on."""
     preset: str = "tabletop-small"
     """Architecture; `textocvp info` lists the presets."""
+    set: tuple[str, ...] = ()
+    """Settings of the preset to change, each part.field=value: `--set parser.initializer=gaussian`."""
     episodes: int | None = 2000
     """Train on the first so many episodes of the file only."""
     steps: int = 2000
@@ -97,7 +99,7 @@ def train(args: ParserTraining) -> ParserQuality:
     """Run or continue stage 1; writes `out`/checkpoint and returns the final quality on the held-out episodes."""
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = TextOCVP(preset(args.preset))
+    model = TextOCVP(with_settings(preset(args.preset), args.set))
     parameters = [*model.parser.parameters(), *model.renderer.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate)
     schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)

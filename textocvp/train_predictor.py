@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.config import ModelConfig, PredictorConfig, preset
+from textocvp.config import ModelConfig, PredictorConfig, preset, with_settings
 from textocvp.episodes import EpisodeFile
 from textocvp.following import Following, FollowingTest, following_questions
 from textocvp.model import TextOCVP
@@ -56,12 +56,8 @@ class PredictorTraining:
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
-    window: int | None = None
-    """Longest past of the predictor in frames, instead of the preset's."""
-    color_bias: bool | None = None
-    """Colour-matching term in the text attention, instead of the preset's choice."""
-    text: Literal["transformer", "lexicon"] | None = None
-    """Text encoder, instead of the preset's choice."""
+    set: tuple[str, ...] = ()
+    """Settings of text encoder and predictor to change, each part.field=value: `--set predictor.layers=2`."""
     steps: int = 1100
     """Updates."""
     batch: int = 32
@@ -194,8 +190,8 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     """
     trained = TextOCVP.from_pretrained(args.parser)
     if args.finetune:
-        for option in ("preset", "window", "color_bias", "text"):
-            if getattr(args, option) is not None:
+        for option in ("preset", "set"):
+            if getattr(args, option):
                 raise ValueError(f"finetune keeps the checkpoint's architecture: leave out {option}")
         for part in (trained.parser, trained.renderer):
             part.requires_grad_(False)
@@ -204,14 +200,12 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     if args.preset is not None:
         chosen = preset(args.preset)
         config = dataclasses.replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
-    predictor, text = config.predictor, config.text
-    if args.window is not None:
-        predictor = dataclasses.replace(predictor, window=args.window)
-    if args.color_bias is not None:
-        predictor = dataclasses.replace(predictor, color_bias=args.color_bias)
-    if args.text is not None:
-        text = dataclasses.replace(text, kind=args.text)
-    model = TextOCVP(dataclasses.replace(config, predictor=predictor, text=text))
+    for setting in args.set:
+        if not setting.startswith(("predictor.", "text.")):
+            raise ValueError(
+                f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
+            )
+    model = TextOCVP(with_settings(config, args.set))
     for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
         part.load_state_dict(source.state_dict())
         part.requires_grad_(False).eval()

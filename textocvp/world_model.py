@@ -181,6 +181,17 @@ class WorldModel:
         slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
         return self._as_rollout(slots_BTKD, tuple(texts), imagined.attention_BSnhKL)
 
+    def imagine(
+        self,
+        obs: Mapping[str, Any] | np.ndarray,
+        text: str | Sequence[str],
+        *,
+        horizon: int,
+        seed: int = 0,
+    ) -> Tensor:
+        """Only the frames (B, horizon + 1, 3, H, W) of `rollout`, as every `textocvp.video.VideoModel` gives them."""
+        return self.rollout(obs, text, horizon=horizon, seed=seed).frames
+
     @torch.no_grad()
     def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
         """Slots of true frames, nothing imagined: what a perfect prediction would be measured at.
