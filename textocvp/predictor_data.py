@@ -3,7 +3,8 @@
 Recolouring: the three colour channels of a scene's slots and of its sentence's lexicon colours are put into
 one random order. A parser whose content ignores hue (see `textocvp.placed`) would have found just these slots
 in the recoloured video, so a few caption colours become many, and the rule "the slot whose colour is the
-word's" is what they share."""
+word's" is what they share. Where words carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red"
+would stay "red" while the red block turns blue."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ class SlotBatches:
         layout: what their numbers mean.
         text: looks the sentences up; its weights are not used.
         frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
-        recolor: permute the colour channels.
+        recolor: permute the colour channels. Has no effect, like `color_spread`, where slots have no explicit colour
+            or the words of `text` no RGB.
         color_spread: stretch each colour channel of a scene and of its sentence by up to this, and shift it by up to
             this, so that colours brighter and darker than the captioned ones are met.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
@@ -67,8 +69,10 @@ class SlotBatches:
         color_jitter: float,
         place_jitter: float,
     ) -> None:
-        self.layout, self.recolor = layout, recolor and layout.explicit
-        self.color_spread, self.color_jitter, self.place_jitter = color_spread, color_jitter, place_jitter
+        words_follow = layout.explicit and text.words_have_rgb
+        self.layout, self.recolor = layout, recolor and words_follow
+        self.color_spread = color_spread if words_follow else 0.0
+        self.color_jitter, self.place_jitter = color_jitter, place_jitter
         self.frames = frames
         self._slots_ETKD = cache.padded(frames)
         self._words = text.lookup(cache.instructions).to("cpu")

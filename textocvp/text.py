@@ -143,6 +143,11 @@ class TextEncoder(nn.Module):
     def device(self) -> torch.device:
         return self.embedding.weight.device
 
+    @property
+    def words_have_rgb(self) -> bool:
+        """Whether colour words carry their RGB. Only then do they still fit a scene whose colours are changed."""
+        return self.config.kind == "lexicon"
+
     def words(self, text: str) -> list[str]:
         """The words of a sentence as the encoder sees them, lower case, one a token.
 

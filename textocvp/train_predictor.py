@@ -30,7 +30,7 @@ from textocvp.config import ModelConfig, PredictorConfig, preset, with_settings
 from textocvp.episodes import EpisodeFile
 from textocvp.following import Following, FollowingTest, following_questions
 from textocvp.model import TextOCVP
-from textocvp.predictor import Predictor
+from textocvp.predictor_base import SlotPredictor
 from textocvp.predictor_data import SlotBatches, true_frames
 from textocvp.predictor_loss import moving_weights, slot_loss
 from textocvp.slot_cache import SlotCache, cached_slots
@@ -79,9 +79,10 @@ class PredictorTraining:
     content_weight: float = 0.3
     """Weight of the error in content."""
     recolor: bool = True
-    """Permute the colour channels of scene and lexicon together."""
+    """Permute the colour channels of scene and lexicon together (text kind `lexicon`; no other words follow)."""
     color_spread: float = 0.0
-    """Stretch and shift each colour channel of scene and lexicon alike, by up to this (without image loss)."""
+    """Stretch and shift each colour channel of scene and lexicon alike, by up to this (text kind `lexicon`, without
+    image loss)."""
     color_jitter: float = 0.03
     """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
     forgetful: float = 0.0
@@ -124,7 +125,7 @@ class Dynamics(nn.Module):
     def __init__(self, model: TextOCVP) -> None:
         super().__init__()
         self.text: TextEncoder = model.text
-        self.predictor: Predictor = model.predictor
+        self.predictor: SlotPredictor = model.predictor
 
     def forward(
         self, seen_BTKD: Tensor, words: WordBatch, imagined: int, forgetful_B: Tensor | None = None
@@ -238,7 +239,7 @@ def fit(
     """
     layout = model.config.parser.layout
     std_C = None
-    if layout.explicit:
+    if model.predictor.standardized:
         mean_C, std_C = batches.content_statistics()
         model.predictor.content_mean_C.copy_(mean_C)
         model.predictor.content_std_C.copy_(std_C)

@@ -11,7 +11,7 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import ModelConfig
+from textocvp.config import ModelConfig, TextConfig
 from textocvp.episodes import EpisodeFile
 from textocvp.following import FollowingTest, Thing, ask, things_of
 from textocvp.model import TextOCVP
@@ -19,6 +19,7 @@ from textocvp.predictor_data import SlotBatches
 from textocvp.predictor_loss import moving_weights, slot_loss
 from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
+from textocvp.text import TextEncoder
 from textocvp.train_predictor import Dynamics, Lesson, PredictorTraining, next_lesson, train, true_frames
 
 LAYOUT = SlotLayout(content=4)
@@ -112,7 +113,8 @@ def test_image_loss_reaches_the_predictor_through_the_frozen_renderer(run):
 
 
 def test_options_replace_the_checkpoints_choices(run):
-    train(run(PLACED, "out", color_bias=False, text="transformer", window=6, steps=1))
+    settings = ("predictor.color_bias=false", "text.kind=transformer", "predictor.window=6")
+    train(run(PLACED, "out", set=settings, steps=1))
     config = TextOCVP.from_pretrained(run(PLACED, "out").out / "checkpoint").config
     assert (config.predictor.color_bias, config.text.kind, config.predictor.window) == (
         False,
@@ -162,6 +164,22 @@ def test_recoloring_permutes_scene_and_words_alike():
         torch.testing.assert_close(after.color[i], before.color[i][..., order])
         torch.testing.assert_close(b.words.colors_BL3[i], a.words.colors_BL3[i][..., order])
     assert torch.equal(after.content, before.content) and torch.equal(after.position, before.position)
+
+
+def test_words_without_rgb_stop_all_recoloring():
+    """Else "red" would be taught to mean whatever colour the red block was given."""
+    text = TextEncoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    plain, asked = (
+        SlotBatches(scenes(), LAYOUT, text, 6, color_jitter=0.0, place_jitter=0.0, **settings)
+        for settings in (dict(recolor=False, color_spread=0.0), dict(recolor=True, color_spread=0.5))
+    )
+    a, b = (source.draw(np.random.default_rng(5), 12) for source in (plain, asked))
+    assert torch.equal(a.slots_BTKD, b.slots_BTKD)
+    assert torch.equal(b.channels_B3, torch.arange(3).expand(12, 3))  # the frames of an image loss stay, too
+    jittered = SlotBatches(
+        scenes(), LAYOUT, text, 6, recolor=True, color_spread=0.5, color_jitter=0.1, place_jitter=0.0
+    ).draw(np.random.default_rng(5), 12)
+    assert jittered.words.colors_BL3.abs().max() == 0
 
 
 def test_spread_keeps_the_match_of_slots_and_words():
