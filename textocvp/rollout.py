@@ -89,6 +89,25 @@ class Rollout:
         """
         return self._decode(frames, self._decoded.frames, self._draw_frames)
 
+    def decode_objects(self, frames: slice | Sequence[int]) -> Tensor:
+        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these times.
+
+        A picture fills the whole frame, also where its slot has no share of the pixels: multiply by the masks to see
+        an object cut out. The sum over the slots of picture times mask is the frame (but for a renderer that
+        overshoots 0..1). These are K times as large as frames and so are not kept.
+
+        Raises:
+            IndexError: if there is no such frame.
+        """
+        times = self._times(frames)
+        B, _, K, D = self.slots.shape
+        with torch.no_grad():
+            drawn = [
+                (self.renderer(chunk).object_frames_BK3HW.float() * 0.5 + 0.5).clamp(0, 1)
+                for chunk in self.slots[:, times].reshape(-1, K, D).split(CHUNK)
+            ]
+        return torch.cat(drawn).unflatten(0, (B, len(times)))
+
     @property
     def masks(self) -> Tensor:
         """(B, T, K, H, W) each slot's share of each pixel; sums to 1 over the slots."""
@@ -102,14 +121,19 @@ class Rollout:
     def _decode(
         self, frames: slice | Sequence[int], drawn: dict[int, Tensor], draw: Callable[[list[int]], None]
     ) -> Tensor:
-        T = self.slots.shape[1]
-        wanted = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
-        if not wanted:
-            raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
+        wanted = self._times(frames)
         missing = [t for t in dict.fromkeys(wanted) if t not in drawn]
         if missing:
             draw(missing)
         return torch.stack([drawn[t] for t in wanted], dim=1)
+
+    def _times(self, frames: slice | Sequence[int]) -> list[int]:
+        """Frame numbers 0..T-1 of a slice or of numbers that may count from the end."""
+        T = self.slots.shape[1]
+        wanted = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
+        if not wanted:
+            raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
+        return wanted
 
     def _draw_masks(self, times: list[int]) -> None:
         B, _, K, D = self.slots.shape

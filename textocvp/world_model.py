@@ -213,6 +213,16 @@ class WorldModel:
         parsed = self.model.parser(flat_N3HW.unflatten(0, (B, T)), generator=self._generator(seed))
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
+    def words(self, text: str) -> list[str]:
+        """A sentence as the text encoder sees it, one word for each weight that `Rollout.attention` gives it.
+
+        Raises:
+            TypeError: if the text is not a string.
+        """
+        if not isinstance(text, str):
+            raise TypeError(f"a text must be a string, not {type(text).__name__}")
+        return self.model.text.words(text)
+
     # ---------------------------------------------------------------- checks
 
     def _first_slots(self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int) -> Tensor:

@@ -41,7 +41,7 @@ class ShapeRenderer(Renderer):
         return Rendered(
             frames_B3HW,
             masks_BKHW,
-            colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size),
+            lambda: colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size),
         )
 
     def masks(self, slots_BKD: Tensor) -> Tensor:

@@ -42,7 +42,7 @@ class BoxRenderer(Renderer):
     def forward(self, slots_BKD: Tensor) -> Rendered:
         masks = self.masks(slots_BKD)
         objects = (COLORS * 2.2 - 1.1)[None, :, :, None, None].expand(len(masks), -1, -1, H, W)  # overshoots
-        return Rendered((masks[:, :, None] * objects).sum(1), masks, objects)
+        return Rendered((masks[:, :, None] * objects).sum(1), masks, lambda: objects)
 
 
 def boxes(B: int = 2, T: int = 4) -> Rollout:
@@ -86,6 +86,20 @@ def test_chosen_frames_are_the_same_as_those_of_all() -> None:
             boxes().decode_masks(wrong)
     with pytest.raises(IndexError, match=r"frames 0\.\.3"):
         boxes().decode_masks([])
+
+
+def test_objects_are_drawn_alone_and_add_up_to_the_frame() -> None:
+    rollout = boxes()
+    objects_BtK3HW = rollout.decode_objects([3, 1])
+    assert objects_BtK3HW.shape == (2, 2, 3, 3, H, W)
+    assert renderer_of(rollout).pictures == 4  # nothing but what was asked for
+    for k, color in enumerate(COLORS):
+        assert torch.equal(objects_BtK3HW[0, 0, k], color[:, None, None].expand(3, H, W))
+    masks_BtKHW = rollout.decode_masks([3, 1])
+    summed = (objects_BtK3HW * masks_BtKHW[:, :, :, None]).sum(2)
+    torch.testing.assert_close(summed, rollout.decode_frames([3, 1]))
+    with pytest.raises(IndexError, match=r"frames 0\.\.3"):
+        rollout.decode_objects([])
 
 
 def test_long_rollouts_are_decoded_in_chunks() -> None:

@@ -112,7 +112,7 @@ def test_attention_is_kept_on_request(world_model: WorldModel, scene: np.ndarray
     rollout = world_model.rollout(scene, [TEXT, "put the red block"], horizon=3, attention=True)
     assert rollout.attention is not None
     predictor, K = world_model.model.config.predictor, world_model.model.config.parser.num_slots
-    words = len(world_model.model.text.words(TEXT))
+    words = len(world_model.words(TEXT))
     assert rollout.attention.shape == (2, 3, predictor.layers, predictor.heads, K, words)
     used = rollout.presence[:, 0] > 0.5 if rollout.layout.explicit else torch.ones(2, K, dtype=torch.bool)
     whole = rollout.attention.sum(-1).movedim(-1, 1)[used]
