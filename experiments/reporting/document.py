@@ -37,13 +37,21 @@ class Card:
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot, drawn once for light and once for dark pages. `name` is the file name of the saved PNG."""
+    """A plot, drawn once for light and once for dark pages.
+
+    Attributes:
+        name: file name of the saved PNG.
+        light, dark: PNG files.
+        alt: what a reader who cannot see it needs to know. caption: a line below it.
+        wide: of many small panels, which need the width of the page.
+    """
 
     name: str
     light: bytes
     dark: bytes
     alt: str
     caption: str = ""
+    wide: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,131 @@
+"""Figures of many small panels: frames of a rollout in rows and columns, and heat maps side by side."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure as Canvas
+
+from experiments.reporting.document import Figure
+from experiments.reporting.plots import DARK, LIGHT, Theme
+
+WIDTH = 7.6  # inches
+
+
+def picture_grid(
+    name: str,
+    pictures: Sequence[Sequence[np.ndarray]],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    *,
+    alt: str,
+    caption: str = "",
+) -> Figure:
+    """Pictures in rows and columns with their names.
+
+    Args:
+        name: file name, with `.png`.
+        pictures: rows of (H, W, 3) or, with transparency, (H, W, 4) uint8. What is transparent takes the colour of the
+            page.
+        rows, columns: names.
+
+    Raises:
+        ValueError: if the pictures do not fit the names.
+    """
+    if len(pictures) != len(rows) or any(len(row) != len(columns) for row in pictures):
+        raise ValueError(
+            f"{len(rows)} x {len(columns)} names, but rows of {[len(row) for row in pictures]} pictures"
+        )
+    side = (WIDTH - 1.5) / len(columns)
+
+    def draw(axes: np.ndarray, theme: Theme) -> None:
+        for (r, c), one in np.ndenumerate(axes):
+            one.imshow(pictures[r][c], interpolation="nearest")
+            one.set_xticks([])
+            one.set_yticks([])
+            for spine in one.spines.values():
+                spine.set(visible=True, color=theme.faint, linewidth=0.6)
+            if r == 0:
+                one.set_title(columns[c], fontsize=9, color=theme.ink, pad=4)
+            if c == 0:
+                one.set_ylabel(rows[r], fontsize=9, color=theme.ink, rotation=0, ha="right", va="center")
+
+    size = (WIDTH, 0.3 + len(rows) * (side + 0.03))
+    return _figure(name, draw, (len(rows), len(columns)), size, alt, caption)
+
+
+def heat_grid(
+    name: str,
+    values: np.ndarray,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    titles: Sequence[Sequence[str]],
+    *,
+    label: str,
+    caption: str = "",
+) -> Figure:
+    """Heat maps of one scale in rows and columns.
+
+    Args:
+        name: file name, with `.png`.
+        values: (panel rows, panel columns, rows, columns) from 0 up; nan stays blank.
+        rows, columns: names of the cells, drawn at the left and at the bottom.
+        titles: one a panel.
+
+    Raises:
+        ValueError: if the values do not fit the names.
+    """
+    values = np.asarray(values, dtype=float)
+    wanted = (len(titles), len(titles[0]), len(rows), len(columns))
+    if values.shape != wanted:
+        raise ValueError(f"values are {values.shape}, the names ask for {wanted}")
+    top = float(np.nanmax(values)) or 1.0
+
+    def draw(axes: np.ndarray, theme: Theme) -> None:
+        ramp = LinearSegmentedColormap.from_list("calm", [theme.page, theme.series[0]]).with_extremes(
+            bad=theme.page
+        )
+        for (r, c), one in np.ndenumerate(axes):
+            one.imshow(values[r, c], cmap=ramp, vmin=0, vmax=top, aspect="auto")
+            one.set_title(titles[r][c], fontsize=9, color=theme.ink, pad=4)
+            one.set_yticks(range(len(rows)), rows if c == 0 else [""] * len(rows), fontsize=8)
+            last = r == len(axes) - 1
+            one.set_xticks(
+                range(len(columns)), columns if last else [""] * len(columns), rotation=90, fontsize=8
+            )
+            one.tick_params(colors=theme.ink, length=0, pad=3)
+            for spine in one.spines.values():
+                spine.set(visible=True, color=theme.faint, linewidth=0.6)
+
+    size = (WIDTH, 0.9 + len(titles) * (0.3 + 0.19 * len(rows)))
+    alt = f"{label}: heat maps of {', '.join(rows)} against {', '.join(columns)}"
+    return _figure(name, draw, (len(titles), len(titles[0])), size, alt, caption)
+
+
+def _figure(
+    name: str,
+    draw: Callable[[np.ndarray, Theme], None],
+    panels: tuple[int, int],
+    size: tuple[float, float],
+    alt: str,
+    caption: str,
+) -> Figure:
+    def png(theme: Theme) -> bytes:
+        canvas = Canvas(figsize=size, dpi=130, facecolor=theme.page, layout="constrained")
+        canvas.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.01, wspace=0.01)  # type: ignore[union-attr,call-arg]
+        FigureCanvasAgg(canvas)
+        axes: np.ndarray = canvas.subplots(*panels, squeeze=False)
+        for one in axes.flat:
+            assert isinstance(one, Axes)
+            one.set_facecolor(theme.page)
+        draw(axes, theme)
+        buffer = io.BytesIO()
+        canvas.savefig(buffer, format="png", metadata={"Software": None})
+        return buffer.getvalue()
+
+    return Figure(name=name, light=png(LIGHT), dark=png(DARK), alt=alt, caption=caption, wide=True)
