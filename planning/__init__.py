@@ -27,6 +27,7 @@ from planning.loop import Attempt, EpisodeResult, run_episode
 from planning.planners import Candidate, Imagines, InstructionPlanner, Plan, Planner, RandomPlanner
 from planning.privileged import PrivilegedGrounder, ground_privileged
 from planning.progress import goal_reached
+from planning.random_sequences import RandomSequencePlanner
 from planning.scores import (
     CarryScore,
     Judge,
@@ -64,6 +65,7 @@ __all__ = [
     "Planner",
     "PrivilegedGrounder",
     "RandomPlanner",
+    "RandomSequencePlanner",
     "Score",
     "SequencePlanner",
     "Thing",

@@ -32,6 +32,7 @@ class Attempt:
         rgb: (H, W, 3) the observation that was planned from.
         plan: what the planner decided.
         instruction: the step of that plan that was carried out.
+        rollout: how that step was imagined, B = 1.
         action: what was done.
         believes_reached: whether the planner's own eyes say afterwards that the goal is reached.
     """
@@ -39,6 +40,7 @@ class Attempt:
     rgb: NDArray[np.uint8]
     plan: Plan
     instruction: Instruction
+    rollout: Rollout
     action: PickAndPlace
     believes_reached: bool
 
@@ -49,6 +51,8 @@ class EpisodeResult:
 
     Attributes:
         success: the simulator's verdict after the last action.
+        gained: by how much the share of the goal's pairs that hold rose, by the environment's rewards: 1 where none
+            held at the start and all do at the end.
         believes_reached: the planner's own verdict at that moment.
         attempts: the turns of the loop; empty if the scene could not be grounded.
         error: why the loop gave up, or None.
@@ -57,6 +61,7 @@ class EpisodeResult:
     """
 
     success: bool
+    gained: float
     believes_reached: bool
     attempts: tuple[Attempt, ...]
     error: str | None
@@ -86,7 +91,8 @@ def run_episode(
 ) -> EpisodeResult:
     """Reset a `control="primitive"` environment and pursue a goal in it.
 
-    From `info` the planner is given the camera only. `is_success` is read for the result and nothing else.
+    From `info` the planner is given the camera only. `is_success` and the reward are read for the result and nothing
+    else.
 
     Args:
         goal: by default what the environment's instruction says.
@@ -113,7 +119,7 @@ def run_episode(
     frames: list[NDArray[np.uint8]] = [rgb[None]]
     attempts: list[Attempt] = []
     queue: list[tuple[Instruction, Rollout]] = []
-    reached, error = False, None
+    reached, gained, error = False, 0.0, None
     for _ in range(max_attempts * len(goal.pairs)):
         try:
             if not queue:
@@ -126,16 +132,23 @@ def run_episode(
             break
         seen = rgb
         within_reach = np.clip(action.to_action(), env.action_space.low, env.action_space.high)
-        observation, _, terminated, truncated, info = env.step(within_reach)
-        rgb = observation["rgb"]
+        observation, reward, terminated, truncated, info = env.step(within_reach)
+        rgb, gained = observation["rgb"], gained + float(reward)
         frames.append(_frames(info, rgb))
         reached = _looks_reached(planner, rgb, goal, _grounder(info, camera, privileged))
-        attempts.append(Attempt(seen, plan, instruction, action, reached))
+        attempts.append(Attempt(seen, plan, instruction, rollout, action, reached))
         if replan:
             queue = []
         if terminated or truncated or (reached if replan else not queue):
             break
-    return EpisodeResult(bool(info["is_success"]), reached, tuple(attempts), error, np.concatenate(frames))
+    return EpisodeResult(
+        success=bool(info["is_success"]),
+        gained=gained,
+        believes_reached=reached,
+        attempts=tuple(attempts),
+        error=error,
+        frames=np.concatenate(frames),
+    )
 
 
 def _grounder(info: Mapping[str, Any], camera: PinholeCamera, privileged: bool) -> Grounder:

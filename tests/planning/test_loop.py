@@ -16,6 +16,7 @@ from planning import (
     InstructionPlanner,
     PinholeCamera,
     RandomPlanner,
+    RandomSequencePlanner,
     SequencePlanner,
     run_episode,
 )
@@ -74,7 +75,7 @@ def oracle_for(env: gym.Env[Any, Any], seed: int, options: dict[str, Any] | None
 def test_the_goal_is_reached_without_the_simulators_state(env: gym.Env[Any, Any], seed: int) -> None:
     planner = InstructionPlanner(oracle_for(env, seed))
     result = run_episode(CameraOnly(env), planner, seed=seed)
-    assert result.success and result.believes_reached and result.error is None
+    assert result.success and result.believes_reached and result.error is None and result.gained == 1.0
     assert result.steps == 1 and result.attempts[0].plan.best.reaches_goal
 
 
@@ -99,7 +100,7 @@ def test_a_missed_pick_is_seen_and_tried_again(env: gym.Env[Any, Any]) -> None:
     once = run_episode(Missing(env, 1), planner, seed=1, replan=False)
     assert not once.success and not once.believes_reached and once.steps == 1
     never = run_episode(Missing(env, 9), planner, seed=1, max_attempts=2)
-    assert not never.success and never.steps == 2
+    assert not never.success and never.steps == 2 and never.gained == 0.0
 
 
 def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:
@@ -135,6 +136,27 @@ def test_goals_of_two_steps(replan: bool) -> None:
         result = run_episode(CameraOnly(env), planner, seed=seed, replan=replan)
         assert result.success and result.believes_reached
         assert result.steps == len(Goal.parse(env.reset(seed=seed)[1]["instruction"]).pairs) >= 2
+    env.close()
+
+
+def test_half_a_goal_is_half_gained() -> None:
+    """Without another look, the step that failed stays undone and the plan's next step is carried out all the same."""
+    env = gym.make("PutBlocksInBowls-v0")
+    planner = SequencePlanner(oracle_for(env, 0))
+    once = run_episode(Missing(env, 1), planner, seed=0, replan=False)
+    assert (once.success, once.gained, once.steps) == (False, 0.5, 2)
+    assert once.attempts[0].plan is once.attempts[1].plan
+    assert [a.rollout.texts[0] for a in once.attempts] == [a.instruction.text for a in once.attempts]
+    again = run_episode(Missing(env, 1), planner, seed=0)
+    assert (again.success, again.gained, again.steps) == (True, 1.0, 3)
+    env.close()
+
+
+def test_the_goals_own_steps_in_random_order_are_carried_out() -> None:
+    env = gym.make("PutBlocksInBowls-v0")
+    planner = RandomSequencePlanner(oracle_for(env, 1), np.random.default_rng(0), told=True)
+    result = run_episode(CameraOnly(env), planner, seed=1, replan=False)
+    assert (result.success, result.steps) == (True, 2)
     env.close()
 
 

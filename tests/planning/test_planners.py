@@ -9,6 +9,7 @@ from planning import (
     Instruction,
     InstructionPlanner,
     RandomPlanner,
+    RandomSequencePlanner,
     SequencePlanner,
 )
 from tests.planning.oracle import OracleWorldModel
@@ -67,6 +68,25 @@ def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, camera, be
     assert sum(candidate.reaches_goal for candidate in plan.ranking) in (1, 2)
     if beam == 0:
         assert len(plan.ranking) == 6 * 3 and sum(c.reaches_goal for c in plan.ranking) == 2
+
+
+def test_random_sequences(oracle: OracleWorldModel, camera) -> None:
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+
+    def sequences(told: bool) -> list[tuple[Instruction, ...]]:
+        planner = RandomSequencePlanner(oracle, np.random.default_rng(0), told)
+        plans = [planner.plan(RGB, goal, AppearanceGrounder(camera)) for _ in range(12)]
+        for plan in plans:  # the second step is imagined from the end of the first
+            assert [rollout.texts[0] for rollout in plan.rollouts] == [s.text for s in plan.best.instructions]
+            np.testing.assert_allclose(plan.rollouts[1].slots[0, 0], plan.rollouts[0].slots[0, -1])
+        return [plan.best.instructions for plan in plans]
+
+    told = sequences(True)
+    assert set(told) == {goal.pairs, goal.pairs[::-1]} and told == sequences(True)
+    invented = sequences(False)
+    assert len(set(invented)) > 4
+    for steps in invented:
+        assert {step.block for step in steps} == {"red", "green"} and len({step.bowl for step in steps}) == 2
 
 
 def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, camera) -> None:
