@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from textocvp.placed import moments
 from textocvp.renderer import Rendered
 from textocvp.slots import SlotState
 
@@ -19,7 +20,8 @@ class ParserLoss:
     Attributes:
         image: mean squared error of the reconstruction, things weighted above the canvas.
         mask: cross-entropy of the drawn masks against the parser's attention.
-        place: squared error of the places that the transition expected against those the corrector found.
+        place: squared error of the places that the transition expected against those the corrector found; for slots
+            without explicit places, of those that the renderer reads off them against those of their attention.
     """
 
     image: Tensor
@@ -63,3 +65,12 @@ def place_loss(expected: SlotState, found: SlotState) -> Tensor:
     error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
     things = found.is_thing[..., 0]
     return torch.where(things, error, torch.zeros_like(error)).sum() / things.sum().clamp_min(1)
+
+
+def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Tensor) -> Tensor:
+    """Mean squared error of places and log-sizes against mean and deviation of the grid under the attention.
+
+    No gradient enters the attention.
+    """
+    center_BK2, deviation_BK2 = moments(attention_BKHW.detach())
+    return ((position_BK2 - center_BK2).square() + (scale_BK2 / deviation_BK2).log().square()).mean()

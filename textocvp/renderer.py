@@ -44,6 +44,14 @@ class Renderer(nn.Module):
         """Only the masks (B, K, H, W), for callers that look at no colours: a planner scores masks."""
         return self(slots_BKD).masks_BKHW
 
+    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Where a renderer that has to read this off unexplained slots takes them to be; None for all others.
+
+        Returns:
+            centres (x, y) in -1..1 and standard deviations along x and y in that unit, each (B, K, 2).
+        """
+        return None
+
 
 def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
     """The renderer that `config.kind` names.
@@ -65,4 +73,8 @@ def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) 
         from textocvp.glimpse import GlimpseRenderer
 
         return GlimpseRenderer(config, layout, image_size)
-    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse")
+    if config.kind == "patches":
+        from textocvp.patches import PatchRenderer
+
+        return PatchRenderer(config, layout, image_size)
+    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse, patches")

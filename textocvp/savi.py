@@ -87,8 +87,7 @@ class GaussianInitializer(nn.Module):
 class ClusterSlots(nn.Module):
     """First slots from clusters of colour and place: the mean feature of each cluster, through a small MLP.
 
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other:
-        in this
+    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
     family a slot has no presence that could switch it off.
     """
 
@@ -100,15 +99,15 @@ class ClusterSlots(nn.Module):
         )
         self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
 
-    def forward(self, frames_B3HW: Tensor, features_BDhw: Tensor, num_slots: int) -> Tensor:
-        """(B, num_slots, D) slots."""
+    def forward(self, frames_B3HW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
+        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers."""
         found = self.clusters(frames_B3HW, num_slots)
         shares_BKL = F.adaptive_avg_pool2d(
             found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
         ).flatten(2)
-        shares_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
-        slots_BKD = self.mlp(shares_BKL @ features_BDhw.flatten(2).transpose(1, 2))
-        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty)
+        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
+        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
+        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL
 
 
 class SlotAttention(nn.Module):
@@ -129,9 +128,14 @@ class SlotAttention(nn.Module):
         self.gru = nn.GRUCell(slot_dim, slot_dim)
         self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
 
-    def forward(self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, first_BKL: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
         slots.
+
+        Args:
+            first_BKL: the first iteration's attention, if it is known already (clusters); sums to 1 over the slots.
 
         Raises:
             ValueError: if `iterations` is below 1.
@@ -141,9 +145,12 @@ class SlotAttention(nn.Module):
         B, K, D = slots_BKD.shape
         features_BLD = self.norm_features(features_BLD)
         keys_BLD, values_BLD = self.key(features_BLD), self.value(features_BLD)
-        for _ in range(iterations):
-            queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
-            attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
+        for iteration in range(iterations):
+            if iteration == 0 and first_BKL is not None:
+                attention_BKL = first_BKL
+            else:
+                queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
+                attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
             # The small constant keeps a slot that won nothing at the mean of all locations instead of at 0/0.
             weights_BKL = attention_BKL + 1e-8
             weights_BKL = weights_BKL / weights_BKL.sum(dim=-1, keepdim=True)
@@ -199,14 +206,17 @@ class SaviParser(SceneParser):
         h, w = features_NDhw.shape[-2:]
         features_BTLD = features_NDhw.flatten(2).transpose(1, 2).unflatten(0, (B, T))
 
+        clusters_BKL = None
         if isinstance(self.initializer, GaussianInitializer):
             guess_BKD = self.initializer(B, K, generator)
         else:
-            guess_BKD = self.initializer(frames_BT3HW[:, 0], features_NDhw.unflatten(0, (B, T))[:, 0], K)
+            first_BDhw = features_NDhw.unflatten(0, (B, T))[:, 0]
+            guess_BKD, clusters_BKL = self.initializer(frames_BT3HW[:, 0], first_BDhw, K)
         slots, attention = [], []
         for t in range(T):
             rounds = self.config.iterations_first if t == 0 else self.config.iterations_next
-            slots_BKD, attention_BKL = self.corrector(guess_BKD, features_BTLD[:, t], rounds)
+            given_BKL = clusters_BKL if t == 0 else None
+            slots_BKD, attention_BKL = self.corrector(guess_BKD, features_BTLD[:, t], rounds, given_BKL)
             slots.append(slots_BKD)
             attention.append(attention_BKL.unflatten(2, (h, w)))
             if t + 1 < T:

@@ -24,7 +24,7 @@ from transformers import get_cosine_schedule_with_warmup
 from textocvp.config import preset, with_settings
 from textocvp.drawing import color_masks
 from textocvp.episodes import EpisodeFile
-from textocvp.losses import ParserLoss, image_loss, mask_loss, place_loss, thing_weights
+from textocvp.losses import ParserLoss, image_loss, mask_loss, place_loss, read_place_loss, thing_weights
 from textocvp.model import TextOCVP
 from textocvp.parser import to_frames
 from textocvp.parser_quality import ParserQuality, measure_parser
@@ -67,7 +67,7 @@ class ParserTraining:
     mask_weight: float = 0.1
     """Weight of the agreement between drawn masks and attention."""
     place_weight: float = 0.1
-    """Weight of the transition's error in place."""
+    """Weight of the transition's error in place, or of the error of the places that the renderer reads."""
     precision: Literal["no", "bf16", "fp16"] = "no"
     """Mixed precision."""
     seed: int = 0
@@ -84,12 +84,16 @@ def parser_loss(model: TextOCVP, frames_BT3HW: Tensor, thing_weight: float) -> P
     """The terms of stage 1 for clips in -1..1."""
     parsed = model.parser(frames_BT3HW)
     target = frames_BT3HW.flatten(0, 1)
-    rendered = model.renderer(parsed.slots_BTKD.flatten(0, 1))
+    slots_NKD, attention_NKHW = parsed.slots_BTKD.flatten(0, 1), parsed.attention_BTKHW.flatten(0, 1)
+    rendered = model.renderer(slots_NKD)
     weights = thing_weights(target, thing_weight)
     mask = place = target.new_zeros(())
+    places = model.renderer.places(slots_NKD)
+    if places is not None:
+        place = read_place_loss(*places, attention_NKHW)
     if parsed.expected_BTKD is not None:
         layout = model.config.parser.layout
-        mask = mask_loss(rendered, parsed.attention_BTKHW.flatten(0, 1), weights)
+        mask = mask_loss(rendered, attention_NKHW, weights)
         found = SlotState.split(parsed.slots_BTKD[:, 1:], layout)
         place = place_loss(SlotState.split(parsed.expected_BTKD, layout), found)
     return ParserLoss(image_loss(rendered, target, weights), mask, place)

@@ -118,7 +118,7 @@ def test_choices_that_do_not_fit_are_errors_that_say_why() -> None:
         parser(initializer="random")
     with pytest.raises(ValueError, match="slot_attention, placed"):
         parser(corrector="none")
-    with pytest.raises(ValueError, match="broadcast, glimpse"):
+    with pytest.raises(ValueError, match="broadcast, glimpse, patches"):
         build_renderer(RendererConfig(kind="none"), SlotLayout(8), 32)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 1 iteration"):
         parser(iterations_first=0)(frames())
