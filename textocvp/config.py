@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from textocvp.slots import SlotLayout
+
+C = TypeVar("C")
+"""A configuration: any dataclass made of the groups below or of its own."""
 
 
 @dataclass(frozen=True)
@@ -152,26 +155,33 @@ class ModelConfig:
         Raises:
             ValueError: if a field is unknown; the message gives its full name and the fields that exist.
         """
-        return _build(cls, data, "config")
+        return build(cls, data, "config")
 
 
-_NESTED = {
-    "parser": ParserConfig,
-    "renderer": RendererConfig,
-    "text": TextConfig,
-    "predictor": PredictorConfig,
-    "layout": SlotLayout,
-}
+def _groups(cls: type) -> dict[str, Any]:
+    """The fields of a configuration that are configurations themselves, and their classes."""
+    hints = get_type_hints(cls)
+    return {f.name: hints[f.name] for f in fields(cls) if is_dataclass(hints[f.name])}
 
 
-def _build(cls: type, data: Mapping[str, Any], path: str) -> Any:
+def build(cls: Any, data: Mapping[str, Any], path: str) -> Any:
+    """A configuration from plain nested dictionaries.
+
+    Args:
+        cls: its dataclass.
+        path: what to call it in messages.
+
+    Raises:
+        ValueError: if a field is unknown or missing; the message gives its full name and the fields that exist.
+    """
     names = [f.name for f in fields(cls)]
     unknown = sorted(set(data) - set(names))
     if unknown:
         raise ValueError(f"{path}: unknown field {unknown[0]!r}; known: {', '.join(names)}")
+    groups = _groups(cls)
     values = {
-        key: _build(_NESTED[key], value, f"{path}.{key}")
-        if key in _NESTED and isinstance(value, Mapping)
+        key: build(groups[key], value, f"{path}.{key}")
+        if key in groups and isinstance(value, Mapping)
         else value
         for key, value in data.items()
     }
@@ -181,7 +191,7 @@ def _build(cls: type, data: Mapping[str, Any], path: str) -> Any:
         raise ValueError(f"{path}: {error}") from error
 
 
-def with_settings(config: ModelConfig, settings: Iterable[str]) -> ModelConfig:
+def with_settings(config: C, settings: Iterable[str]) -> C:
     """The configuration with some fields changed, each written `part.field=value`.
 
     For example `predictor.layers=2`, `predictor.residual=false`, `parser.layout.content=32`.
@@ -199,15 +209,15 @@ def with_settings(config: ModelConfig, settings: Iterable[str]) -> ModelConfig:
 
 
 def _changed(node: Any, names: list[str], text: str, path: str) -> Any:
-    known = [f.name for f in fields(node)]
+    known, groups = [f.name for f in fields(node)], _groups(type(node))
     if names[0] not in known:
         raise ValueError(f"unknown setting {path!r}: no field {names[0]!r}; known: {', '.join(known)}")
     value = getattr(node, names[0])
     if len(names) > 1:
-        if names[0] not in _NESTED:
+        if names[0] not in groups:
             raise ValueError(f"unknown setting {path!r}: {names[0]!r} has no fields")
         return replace(node, **{names[0]: _changed(value, names[1:], text, path)})
-    if names[0] in _NESTED:
+    if names[0] in groups:
         raise ValueError(f"{path!r} is a group; set one of {', '.join(f.name for f in fields(value))}")
     try:
         chosen = json.loads(text)
