@@ -63,7 +63,41 @@ PREDICTOR_RUNS = (
     AblationRun("text-minilm", "predictor", "text", "MiniLM, frozen", settings=("text.kind=minilm", NO_BIAS)),
 )
 
-RUNS = PREDICTOR_RUNS
+PARSER_RUNS = (
+    AblationRun(
+        "savi-cluster-prior",
+        "parser",
+        "initializer and decoder",
+        "clusters, decoder with prior",
+        "savi-small",
+    ),
+    AblationRun(
+        "savi-cluster",
+        "parser",
+        "initializer and decoder",
+        "clusters, decoder without prior",
+        "savi-small",
+        ("renderer.mask_prior=false",),
+    ),
+    AblationRun(
+        "savi-gaussian-prior",
+        "parser",
+        "initializer and decoder",
+        "Gaussian, decoder with prior",
+        "savi-small",
+        ("parser.initializer=gaussian",),
+    ),
+    AblationRun(
+        "savi-gaussian",
+        "parser",
+        "initializer and decoder",
+        "Gaussian, decoder without prior",
+        "savi-small",
+        ("parser.initializer=gaussian", "renderer.mask_prior=false"),
+    ),
+)
+
+RUNS = PREDICTOR_RUNS + PARSER_RUNS
 
 
 def run_named(name: str) -> AblationRun:
