@@ -26,6 +26,11 @@ class StudyModel(Imagines, Protocol):
     @property
     def checkpoint(self) -> Checkpoint: ...
 
+    @property
+    def longest_horizon(self) -> int | None:
+        """How many frames it can imagine at once; None for as many as you like."""
+        ...
+
 
 class LoadWorldModel(Protocol):
     """Makes the world model. Hashable and equal for equal models, so that a process makes each only once."""
@@ -55,6 +60,13 @@ class Worker:
 
     world_model: StudyModel
     _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
+    _others: dict[LoadWorldModel, StudyModel] = field(default_factory=dict)
+
+    def other(self, load: LoadWorldModel) -> StudyModel:
+        """Another world model, as a baseline, made once a process."""
+        if load not in self._others:
+            self._others[load] = load()
+        return self._others[load]
 
     def environment(self, scene: TestScene) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""

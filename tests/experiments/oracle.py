@@ -55,6 +55,7 @@ class StudyOracle:
     """See the module."""
 
     checkpoint = Checkpoint("oracle", "0" * 64)
+    longest_horizon = 24
 
     def __init__(self, stubborn: Sequence[str]) -> None:
         self._stubborn = stubborn
