@@ -86,19 +86,28 @@ class TextConfig:
     """From a sentence to tokens.
 
     Attributes:
-        kind: `transformer` (small, from scratch) or `lexicon` (the same, and every token also carries the RGB of the
-            colour that it names, from a public colour lexicon).
+        kind: `transformer` (small, from scratch), `lexicon` (the same, and every token also carries the RGB of the
+            colour that it names, from a public colour lexicon), `t5` (a pretrained T5 encoder, the paper's default)
+            or `minilm` (the pretrained sentence model all-MiniLM-L6-v2).
         dim: width of the token embeddings handed to the predictor.
-        layers, heads, hidden: the transformer.
-        max_tokens: longest sentence in words; a longer one is an error.
+        layers, heads, hidden: the transformer (`transformer` and `lexicon` only).
+        max_tokens: longest sentence in words (`t5`, `minilm`: subwords and end marks); a longer one is an error.
+        weights: folder or hub id of the pretrained weights; empty for google-t5/t5-small from the hub, or for the
+            Python package of MiniLM (`t5` and `minilm` only).
+        frozen: keep the pretrained weights as they are and out of checkpoints; else they are fine-tuned and stored
+            (`t5` and `minilm` only).
+        fingerprint: of the frozen weights, set when they are first used; other weights are then an error.
     """
 
-    kind: Literal["transformer", "lexicon"] = "lexicon"
+    kind: Literal["transformer", "lexicon", "t5", "minilm"] = "lexicon"
     dim: int = 128
     layers: int = 2
     heads: int = 4
     hidden: int = 256
     max_tokens: int = 64
+    weights: str = ""
+    frozen: bool = True
+    fingerprint: str = ""
 
 
 @dataclass(frozen=True)

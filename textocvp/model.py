@@ -1,13 +1,15 @@
 """TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
 
 A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the
-model, and no other). Loading is strict: a checkpoint that does not fit is an error that names the field or
-the tensor. Nothing is ever unpickled.
+model, and no other). A frozen pretrained text encoder is not in it: `config.json` has its name and
+fingerprint. Of a fine-tuned one the folder `text` holds architecture and tokenizer. Loading is strict: a
+checkpoint that does not fit is an error that names the field or the tensor. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,11 @@ from textocvp.config import ModelConfig
 from textocvp.parser import build_parser
 from textocvp.predictor import Predictor
 from textocvp.renderer import build_renderer
-from textocvp.text import TextEncoder
+from textocvp.text import build_text_encoder
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
+TEXT_FOLDER = "text"  # only where a fine-tuned text encoder needs it
 
 
 class CheckpointError(ValueError):
@@ -45,13 +48,24 @@ class TextOCVP(
         text: sentences to tokens.
         predictor: slots and tokens to the slots of the next frames.
         renderer: slots to frames and masks.
+
+    Args:
+        text_files: the text encoder's own folder, of a checkpoint that is being loaded.
+
+    Raises:
+        ValueError: if parts do not fit each other, or pretrained weights are missing.
     """
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, text_files: Path | None = None) -> None:
         super().__init__()
-        self.config = config
         self.parser = build_parser(config.parser)
-        self.text = TextEncoder(config.text)
+        self.text = build_text_encoder(config.text, text_files)
+        if config.predictor.color_bias and not self.text.words_have_rgb:
+            raise ValueError(
+                "predictor.color_bias=true needs words that carry RGB, which is text.kind=lexicon, not "
+                f"{config.text.kind!r}: set predictor.color_bias=false"
+            )
+        self.config = replace(config, text=self.text.config)  # says which frozen weights these are
         self.predictor = Predictor(config.predictor, config.parser.layout, config.text.dim)
         self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
 
@@ -67,6 +81,7 @@ class TextOCVP(
             name: tensor.detach().cpu().contiguous().clone() for name, tensor in self.state_dict().items()
         }
         save_file(tensors, save_directory / WEIGHTS_FILE, metadata={"format": "pt"})
+        self.text.save_files(save_directory / TEXT_FOLDER)
         text = json.dumps(self.config.to_dict(), indent=2) + "\n"
         (save_directory / CONFIG_FILE).write_text(text, encoding="utf-8")
 
@@ -101,7 +116,7 @@ class TextOCVP(
                     cache_dir=cache_dir,
                     local_files_only=local_files_only,
                     token=token,
-                    allow_patterns=[CONFIG_FILE, WEIGHTS_FILE],
+                    allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"],
                 )
             # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
             except Exception as error:
@@ -112,7 +127,7 @@ class TextOCVP(
             folder = Path(found)
         config = read_config(folder)
         try:
-            model = cls(config)
+            model = cls(config, folder / TEXT_FOLDER)
         except (ValueError, TypeError) as error:
             raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
         load_weights(model, folder / WEIGHTS_FILE)

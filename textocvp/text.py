@@ -1,49 +1,23 @@
-"""From sentences to tokens: word-level text encoders trained from scratch.
+"""From sentences to tokens: the interface that every text encoder has, and the one place that picks one.
 
-Two kinds (`TextConfig.kind`). `transformer`: a learned embedding for every word of the caption grammar and
-every training colour, then a small transformer (the paper finds such an encoder equal to T5 on CATER).
-`lexicon`: the same, but all colour words share one embedding and differ only in the RGB that a public lexicon
-gives for their name, so a colour that no caption ever named is understood like any other.
+Four kinds (`TextConfig.kind`). `transformer` and `lexicon` read words and are trained from scratch
+(`textocvp.text_words`); `t5` and `minilm` read subwords and come pretrained (`textocvp.text_pretrained`).
 """
 
 from __future__ import annotations
 
 import math
-import re
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.attention import FeedForward, SelfAttention
 from textocvp.config import TextConfig
-from textocvp.lexicon import longest_name, palette
 
-# Row 0 is padding, so that a padded batch needs no other bookkeeping. The order is part of every checkpoint:
-# append.
-SPECIAL = ("<pad>", "<unk>", "<color>")
-GRAMMAR = (
-    "put",
-    "the",
-    "block",
-    "in",
-    "bowl",
-    "and",
-    "then",
-    "into",
-    "a",
-    "on",
-    "place",
-    "move",
-    "of",
-    "with",
-    "to",
-)
-TRAIN_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
-PAD, UNKNOWN, COLOR = range(3)
-
-_WORD = re.compile(r"[a-z0-9']+")
+RGB = tuple[float, float, float]
 
 
 @dataclass
@@ -51,8 +25,8 @@ class TextTokens:
     """A batch of encoded sentences.
 
     Attributes:
-        embeddings_BLC: contextual token embeddings; zero where there is no word.
-        mask_BL: True where there is a word.
+        embeddings_BLC: contextual token embeddings; zero where there is no token.
+        mask_BL: True where there is a token: a word, or for the pretrained encoders a subword or end mark.
         colors_BL3: RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere).
         names_color_BL: True where `colors_BL3` means something.
     """
@@ -80,7 +54,7 @@ class WordBatch:
     """Sentences before encoding: what the lexicon says about every word, still free of learned parameters.
 
     Attributes:
-        ids_BL: row in the vocabulary; 0 is padding.
+        ids_BL: row in the encoder's vocabulary, `pad` of the encoder where there is no word.
         colors_BL3, names_color_BL: as in `TextTokens`.
     """
 
@@ -101,132 +75,86 @@ class WordBatch:
         return WordBatch(self.ids_BL.to(device), self.colors_BL3.to(device), self.names_color_BL.to(device))
 
 
-class _Block(nn.Module):
-    """Pre-norm transformer encoder block over the words of a sentence."""
-
-    def __init__(self, config: TextConfig) -> None:
-        super().__init__()
-        self.norm_attention = nn.LayerNorm(config.dim, eps=1e-6)
-        self.attention = SelfAttention(config.dim, config.heads)
-        self.norm_feed_forward = nn.LayerNorm(config.dim, eps=1e-6)
-        self.feed_forward = FeedForward(config.dim, config.hidden)
-
-    def forward(self, x_BLC: Tensor, bias_B11L: Tensor) -> Tensor:
-        x_BLC = x_BLC + self.attention(self.norm_attention(x_BLC), bias_B11L)
-        return x_BLC + self.feed_forward(self.norm_feed_forward(x_BLC))
-
-
 class TextEncoder(nn.Module):
-    """Sentences to `TextTokens`.
+    """Sentences to `TextTokens`. Subclasses write `words`, `encode` and `_rows`.
 
     Padding is masked everywhere (the authors' code does not mask it in the cross-attention), so what a
     sentence means does not depend on its neighbours in the batch.
+
+    Attributes:
+        config: what it was built from; of a frozen pretrained encoder also the fingerprint of its weights.
+        pad: the row in the vocabulary that stands for no token.
+        unit: what one token is called.
+        words_have_rgb: whether colour words carry their RGB. Only then do they still fit a scene whose colours are
+            changed, and only then can slots be matched with words by colour.
     """
 
-    positions_LC: Tensor
-
-    def __init__(self, config: TextConfig) -> None:
-        super().__init__()
-        self.config = config
-        vocabulary = SPECIAL + GRAMMAR + (TRAIN_COLORS if config.kind == "transformer" else ())
-        self._rows = {word: row for row, word in enumerate(vocabulary)}
-        self.embedding = nn.Embedding(len(vocabulary), config.dim, padding_idx=PAD)
-        nn.init.normal_(self.embedding.weight, std=0.5)
-        with torch.no_grad():
-            self.embedding.weight[PAD].zero_()
-        self.color_projection = nn.Linear(3, config.dim, bias=False) if config.kind == "lexicon" else None
-        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
-        self.norm = nn.LayerNorm(config.dim, eps=1e-6)
-        self.register_buffer("positions_LC", sinusoids(config.max_tokens, config.dim), persistent=False)
+    config: TextConfig
+    pad: int = 0
+    unit: str = "word"
+    words_have_rgb: bool = False
 
     @property
+    @abstractmethod
     def device(self) -> torch.device:
-        return self.embedding.weight.device
+        """Where its learned parameters are."""
+        raise NotImplementedError
 
-    @property
-    def words_have_rgb(self) -> bool:
-        """Whether colour words carry their RGB. Only then do they still fit a scene whose colours are changed."""
-        return self.config.kind == "lexicon"
-
+    @abstractmethod
     def words(self, text: str) -> list[str]:
-        """The words of a sentence as the encoder sees them, lower case, one a token.
-
-        A colour name of several words ("light blue") is one token of the `lexicon` encoder.
-        """
-        found = _WORD.findall(text.lower())
-        if self.config.kind != "lexicon":
-            return found
-        merged, at = [], 0
-        while at < len(found):
-            # Words of the grammar stay words, also where some palette calls a colour by one of them.
-            length = 1 if found[at] in self._rows else self._color_length(found, at)
-            merged.append(" ".join(found[at : at + length]))
-            at += length
-        return merged
-
-    def _color_length(self, words: list[str], at: int) -> int:
-        for length in range(min(longest_name(), len(words) - at), 1, -1):
-            if tuple(words[at : at + length]) in palette():
-                return length
-        return 1
-
-    def _row_and_color(self, word: str) -> tuple[int, tuple[float, float, float] | None]:
-        if word in self._rows:
-            return self._rows[word], None
-        color = palette().get(tuple(word.split())) if self.config.kind == "lexicon" else None
-        return (UNKNOWN, None) if color is None else (COLOR, color)
+        """What each token of a sentence stands for, in order."""
+        raise NotImplementedError
 
     def unknown_words(self, text: str) -> list[str]:
-        """The words that mean nothing to this encoder, in order, each once: for a warning that names them."""
-        return list(dict.fromkeys(w for w in self.words(text) if self._row_and_color(w)[0] == UNKNOWN))
+        """The words that mean nothing to this encoder, in order, each once: for a warning that names them.
+
+        Encoders that read subwords can spell any word, and know none to be unknown.
+        """
+        return []
+
+    @abstractmethod
+    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
+        """Of each token its row in the vocabulary, and the RGB (0..1) that it names; nothing for an empty text."""
+        raise NotImplementedError
 
     def lookup(self, texts: Sequence[str]) -> WordBatch:
         """Vocabulary rows and lexicon colours of the sentences, padded to the longest.
 
         Raises:
-            ValueError: if a sentence has no word at all or more than `max_tokens`.
+            ValueError: if a sentence has no word at all or more than `max_tokens` tokens.
         """
         if isinstance(texts, str):
             raise TypeError("texts must be a sequence of sentences, not one string")
-        sentences = [self.words(text) for text in texts]
+        sentences = [self._rows(text) for text in texts]
         for text, sentence in zip(texts, sentences, strict=True):
             if not sentence:
                 raise ValueError(f"a text needs at least one word, got {text!r}")
-            if len(sentence) > self.config.max_tokens:
-                raise ValueError(
-                    f"a text may have at most {self.config.max_tokens} words, this has {len(sentence)}"
-                )
+            self._check_length(len(sentence), "this")
         shape = (len(sentences), max(map(len, sentences), default=1))
-        ids_BL, colors_BL3 = torch.full(shape, PAD), torch.zeros(*shape, 3)
+        ids_BL, colors_BL3 = torch.full(shape, self.pad), torch.zeros(*shape, 3)
         names_color_BL = torch.zeros(shape, dtype=torch.bool)
         for b, sentence in enumerate(sentences):
-            for position, word in enumerate(sentence):
-                row, color = self._row_and_color(word)
+            for position, (row, color) in enumerate(sentence):
                 ids_BL[b, position] = row
                 if color is not None:
                     colors_BL3[b, position] = torch.tensor(color) * 2 - 1
                     names_color_BL[b, position] = True
         return WordBatch(ids_BL, colors_BL3, names_color_BL).to(self.device)
 
-    def encode(self, words: WordBatch) -> TextTokens:
-        """Embed looked-up words."""
-        mask_BL = words.ids_BL != PAD
-        length = mask_BL.shape[1]
-        if length > self.config.max_tokens:
+    def _check_length(self, tokens: int, what: str) -> None:
+        if tokens > self.config.max_tokens:
             raise ValueError(
-                f"a text may have at most {self.config.max_tokens} words, this batch has {length}"
+                f"a text may have at most {self.config.max_tokens} {self.unit}s, {what} has {tokens}"
             )
-        x_BLC = self.embedding(words.ids_BL)
-        if self.color_projection is not None:
-            x_BLC = x_BLC + self.color_projection(words.colors_BL3) * words.names_color_BL[..., None]
-        x_BLC = x_BLC + self.positions_LC[:length]
-        bias_B11L = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, -math.inf)[
-            :, None, None
-        ]
-        for block in self.blocks:
-            x_BLC = block(x_BLC, bias_B11L)
-        x_BLC = self.norm(x_BLC) * mask_BL[..., None]
-        return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
+
+    @abstractmethod
+    def encode(self, words: WordBatch) -> TextTokens:
+        """Embed looked-up words.
+
+        Raises:
+            ValueError: if they are more than `max_tokens`.
+        """
+        raise NotImplementedError
 
     def forward(self, texts: Sequence[str]) -> TextTokens:
         """Encode sentences.
@@ -235,6 +163,32 @@ class TextEncoder(nn.Module):
             ValueError: see `lookup`.
         """
         return self.encode(self.lookup(texts))
+
+    def save_files(self, folder: Path) -> None:
+        """Write what a checkpoint needs besides tensors into `folder`, which it makes if there is anything."""
+
+
+def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEncoder:
+    """The text encoder that `config.kind` names.
+
+    Args:
+        files: the folder that `save_files` was given, of a checkpoint that is being loaded. A fine-tuned encoder is
+            then built from it alone, for the checkpoint's tensors to fill.
+
+    Raises:
+        ValueError: if there is no such kind, or its pretrained weights are missing or others than the configuration
+            says; the message says where to get them.
+    """
+    # Imported here because the encoders import this module for their base class.
+    if config.kind in ("transformer", "lexicon"):
+        from textocvp.text_words import WordEncoder
+
+        return WordEncoder(config)
+    if config.kind in ("t5", "minilm"):
+        from textocvp.text_pretrained import PretrainedEncoder
+
+        return PretrainedEncoder(config, files)
+    raise ValueError(f"unknown text.kind {config.kind!r}; known: transformer, lexicon, t5, minilm")
 
 
 def sinusoids(length: int, dim: int) -> Tensor:

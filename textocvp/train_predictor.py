@@ -201,6 +201,8 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     if args.preset is not None:
         chosen = preset(args.preset)
         config = dataclasses.replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
+    # The text encoder is new, and so are its weights if they are frozen ones.
+    config = dataclasses.replace(config, text=dataclasses.replace(config.text, fingerprint=""))
     for setting in args.set:
         if not setting.startswith(("predictor.", "text.")):
             raise ValueError(

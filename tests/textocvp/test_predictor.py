@@ -9,7 +9,7 @@ from textocvp.config import PredictorConfig, TextConfig
 from textocvp.predictor import Predictor
 from textocvp.predictor_layer import color_match
 from textocvp.slots import SlotLayout, SlotState
-from textocvp.text import TextEncoder
+from textocvp.text import build_text_encoder
 
 EXPLICIT = SlotLayout(content=6)
 IMPLICIT = SlotLayout(content=12, explicit=False)
@@ -47,7 +47,7 @@ def scene(layout=EXPLICIT, batch=2, frames=4, slots=7, absent=2) -> torch.Tensor
 
 def text(texts=TEXTS):
     torch.manual_seed(3)
-    return TextEncoder(TextConfig(dim=32, hidden=64)).eval()(texts)
+    return build_text_encoder(TextConfig(dim=32, hidden=64)).eval()(texts)
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,15 @@ import torch
 
 from textocvp.config import TextConfig
 from textocvp.lexicon import TABLEAU_10, color_of, palette
-from textocvp.text import COLOR, TextEncoder
+from textocvp.text import TextEncoder, build_text_encoder
+from textocvp.text_words import COLOR
 
 CAPTION = "put the red block in the gray bowl"
 
 
 def encoder(kind: str) -> TextEncoder:
     torch.manual_seed(0)
-    return TextEncoder(TextConfig(kind=kind, dim=32, hidden=64)).eval()
+    return build_text_encoder(TextConfig(kind=kind, dim=32, hidden=64)).eval()
 
 
 @pytest.mark.parametrize("kind", ["transformer", "lexicon"])

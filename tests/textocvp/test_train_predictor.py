@@ -19,7 +19,7 @@ from textocvp.predictor_data import SlotBatches
 from textocvp.predictor_loss import moving_weights, slot_loss
 from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
-from textocvp.text import TextEncoder
+from textocvp.text import build_text_encoder
 from textocvp.train_predictor import Dynamics, Lesson, PredictorTraining, next_lesson, train, true_frames
 
 LAYOUT = SlotLayout(content=4)
@@ -168,7 +168,7 @@ def test_recoloring_permutes_scene_and_words_alike():
 
 def test_words_without_rgb_stop_all_recoloring():
     """Else "red" would be taught to mean whatever colour the red block was given."""
-    text = TextEncoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    text = build_text_encoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
     plain, asked = (
         SlotBatches(scenes(), LAYOUT, text, 6, color_jitter=0.0, place_jitter=0.0, **settings)
         for settings in (dict(recolor=False, color_spread=0.0), dict(recolor=True, color_spread=0.5))

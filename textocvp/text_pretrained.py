@@ -1,0 +1,159 @@
+"""Pretrained text encoders, which read subwords: T5 (the paper's, frozen or fine-tuned) and MiniLM.
+
+Their words carry no RGB. A colour word may fall apart into several subwords, and what the pretrained weights know of
+it is the very thing to be compared with a colour lexicon. So `color_bias` and recolouring are for the lexicon only.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from textocvp.config import TextConfig
+from textocvp.text import RGB, TextEncoder, TextTokens, WordBatch
+from textocvp.text_weights import (
+    CONFIG_FILE,
+    TOKENIZER_FILE,
+    TextWeightsError,
+    fingerprint,
+    new_encoder,
+    pretrained_encoder,
+    read_config,
+    read_tokenizer,
+    weights_folder,
+)
+
+KEPT = 4096  # sentences: T5-small's 20 tokens of 512 floats each make 170 MB of that many
+
+
+class FrozenStates:
+    """A pretrained encoder as a constant: from token rows to token states, each distinct sentence computed once.
+
+    No `nn.Module` on purpose: so its weights are in no checkpoint and no optimizer, and `train()` cannot switch its
+    dropout on. Each sentence is computed by itself, so its states do not depend on its neighbours, not even in the
+    last digit.
+    """
+
+    def __init__(self, encoder: nn.Module) -> None:
+        self.encoder = encoder.eval().requires_grad_(False)
+        self.computed = 0
+        self._known: OrderedDict[tuple[int, ...], Tensor] = OrderedDict()
+
+    def __call__(self, ids_BL: Tensor, mask_BL: Tensor) -> Tensor:
+        """States (B, L, C), float32; zero where `mask_BL` is False."""
+        lengths = mask_BL.sum(dim=1).tolist()
+        found = [
+            self._of(tuple(row[:length]), ids_BL.device)
+            for row, length in zip(ids_BL.tolist(), lengths, strict=True)
+        ]
+        states_BLC = torch.zeros(*ids_BL.shape, found[0].shape[-1])
+        for b, states_LC in enumerate(found):
+            states_BLC[b, : len(states_LC)] = states_LC
+        return states_BLC.to(ids_BL.device)
+
+    @torch.no_grad()
+    def _of(self, ids: tuple[int, ...], device: torch.device) -> Tensor:
+        if ids in self._known:
+            self._known.move_to_end(ids)
+            return self._known[ids]
+        ids_1L = torch.tensor([ids], device=device)
+        # What is kept must not depend on the precision of the training step that asks first.
+        with torch.autocast(device.type, enabled=False):
+            states_1LC = states(self.encoder.to(device), ids_1L, torch.ones_like(ids_1L))
+        self.computed += 1
+        self._known[ids] = states_1LC[0].cpu()
+        if len(self._known) > KEPT:
+            self._known.popitem(last=False)
+        return self._known[ids]
+
+
+def states(encoder: nn.Module, ids_BL: Tensor, mask_BL: Tensor) -> Tensor:
+    """What the last layer says of every token (B, L, C)."""
+    return encoder(input_ids=ids_BL, attention_mask=mask_BL.long()).last_hidden_state
+
+
+class PretrainedEncoder(TextEncoder):
+    """The kinds `t5` and `minilm`: one token a subword, and the end marks that the pretrained model is used to.
+
+    A linear layer brings its states to `config.dim`; where they have that width already, there is none (T5-small:
+    512, as wide as the published predictor).
+
+    Args:
+        config: the kind, and where its weights are.
+        files: of a fine-tuned encoder in a checkpoint: the folder that `save_files` wrote.
+
+    Raises:
+        TextWeightsError: if the weights are missing or damaged, or not those of `config.fingerprint`.
+        ValueError: if the model cannot read `config.max_tokens`.
+    """
+
+    unit = "token"
+    _here: Tensor
+
+    def __init__(self, config: TextConfig, files: Path | None = None) -> None:
+        super().__init__()
+        stored = files is not None and not config.frozen
+        folder = files if files is not None and stored else weights_folder(config)
+        self._architecture = read_config(folder, config.kind)
+        self._tokenizer = read_tokenizer(folder)
+        longest = getattr(self._architecture, "max_position_embeddings", None)  # T5 has no limit
+        if longest is not None and config.max_tokens > longest:
+            raise ValueError(
+                f"text.max_tokens={config.max_tokens}: {config.kind} reads {longest} tokens at most"
+            )
+        self.pad = self._architecture.pad_token_id
+        encoder = (
+            new_encoder(self._architecture) if stored else pretrained_encoder(folder, self._architecture)
+        )
+        self.frozen = FrozenStates(encoder) if config.frozen else None
+        self.encoder = None if config.frozen else encoder
+        self.config = replace(config, fingerprint=_checked(config, folder)) if config.frozen else config
+        width = self._architecture.hidden_size
+        self.projection = nn.Identity() if width == config.dim else nn.Linear(width, config.dim)
+        self.register_buffer("_here", torch.empty(0), persistent=False)  # there may be no parameter to ask
+
+    @property
+    def device(self) -> torch.device:
+        return self._here.device
+
+    def words(self, text: str) -> list[str]:
+        return self._tokenizer.encode(text).tokens if _says_something(text) else []
+
+    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
+        return [(row, None) for row in self._tokenizer.encode(text).ids] if _says_something(text) else []
+
+    def encode(self, words: WordBatch) -> TextTokens:
+        mask_BL = words.ids_BL != self.pad
+        self._check_length(mask_BL.shape[1], "this batch")
+        if self.encoder is not None:
+            states_BLC = states(self.encoder, words.ids_BL, mask_BL)
+        else:
+            assert self.frozen is not None
+            states_BLC = self.frozen(words.ids_BL, mask_BL)
+        x_BLC = self.projection(states_BLC) * mask_BL[..., None]
+        return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
+
+    def save_files(self, folder: Path) -> None:
+        if self.encoder is None:  # frozen: the checkpoint refers to the weights by name and fingerprint
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        self._architecture.to_json_file(folder / CONFIG_FILE, use_diff=False)
+        self._tokenizer.save(str(folder / TOKENIZER_FILE))
+
+
+def _says_something(text: str) -> bool:
+    return any(character.isalnum() for character in text)
+
+
+def _checked(config: TextConfig, folder: Path) -> str:
+    found = fingerprint(folder)
+    if config.fingerprint not in ("", found):
+        raise TextWeightsError(
+            f"text.fingerprint: this was made with other weights of the text encoder {config.kind!r} "
+            f"({config.fingerprint[:12]}) than those in {folder} ({found[:12]}); give those in text.weights"
+        )
+    return found
