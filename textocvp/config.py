@@ -115,6 +115,8 @@ class PredictorConfig:
     """From slots and text to the slots of the next frame.
 
     Attributes:
+        kind: `textocvp` (published) or `ocvp-seq` (a baseline that hears no text: `layers` of object attention, then
+            time attention).
         dim: token width. layers, heads, hidden: the transformer (`hidden` of every feed-forward net).
         attention: `window` (published: bidirectional over the last `window` frames, recomputed each step) or
             `causal` (each frame sees itself and its past; keys and values are cached).
@@ -124,8 +126,11 @@ class PredictorConfig:
         color_bias: add the colour-matching term to the text-to-slot attention (needs the lexicon encoder and explicit
             slot colours).
         feed_forwards: feed-forward nets a layer: 2 as the authors' code, 1 as the text.
+        standardize: read and change content in units of its deviation over the training slots. Always done with
+            explicit slots; the published model does not.
     """
 
+    kind: Literal["textocvp", "ocvp-seq"] = "textocvp"
     dim: int = 512
     layers: int = 8
     heads: int = 8
@@ -136,6 +141,7 @@ class PredictorConfig:
     residual: bool = True
     color_bias: bool = False
     feed_forwards: Literal[1, 2] = 2
+    standardize: bool = False
 
 
 @dataclass(frozen=True)
@@ -294,6 +300,22 @@ PRESETS: dict[str, ModelConfig] = {
         text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
     ),
 }
+
+# OCVP-Seq, the predictor without text: beside the shipped model, and at its published size beside TextOCVP-SAVi.
+PRESETS["ocvp-seq-small"] = replace(
+    PRESETS["tabletop-small"],
+    name="ocvp-seq-small",
+    predictor=PredictorConfig(
+        kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24
+    ),
+)
+PRESETS["ocvp-seq"] = replace(
+    PRESETS["savi-cater"],
+    name="ocvp-seq",
+    predictor=PredictorConfig(
+        kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal"
+    ),
+)
 
 
 def preset(name: str) -> ModelConfig:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from textocvp.config import ModelConfig
 from textocvp.parser import build_parser
-from textocvp.predictor import Predictor
+from textocvp.predictor import build_predictor
 from textocvp.renderer import build_renderer
 from textocvp.text import build_text_encoder
 
@@ -66,7 +66,7 @@ class TextOCVP(
                 f"{config.text.kind!r}: set predictor.color_bias=false"
             )
         self.config = replace(config, text=self.text.config)  # says which frozen weights these are
-        self.predictor = Predictor(config.predictor, config.parser.layout, config.text.dim)
+        self.predictor = build_predictor(config.predictor, config.parser.layout, config.text.dim)
         self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
 
     @property

@@ -23,8 +23,8 @@ class SlotLoss:
     Attributes:
         position: Huber loss of the centre, in units of about a pixel.
         scale: squared error of the log-scale, in tenths.
-        content: squared error of the content in units of its standard deviation; the whole slot's squared
-            error when slots have no explicit channels.
+        content: squared error of the content in units of its standard deviation (of the content as it is where
+            none is given). Without explicit channels the whole slot is content.
     """
 
     position: Tensor
@@ -51,14 +51,18 @@ def slot_loss(
 
     Args:
         weights_BTK: how much each slot counts, see `moving_weights`.
-        content_std_C: standard deviation of each content channel over the training slots; None (not needed)
-            for slots without explicit channels.
+        content_std_C: standard deviation of each content channel over the training slots; None for slots without
+            explicit channels that are compared as they are.
     """
     weights_BTK = weights_BTK / weights_BTK.sum().clamp(min=1e-6)
-    if content_std_C is None:
-        error_BTK = (predicted_BTKD - target_BTKD).square().mean(dim=-1)
+    if not layout.explicit:
+        error_BTKD = predicted_BTKD - target_BTKD
+        if content_std_C is not None:
+            error_BTKD = error_BTKD / content_std_C
+        error_BTK = error_BTKD.square().mean(dim=-1)
         zero = error_BTK.new_zeros(())
         return SlotLoss(zero, zero, (weights_BTK * error_BTK).sum())
+    assert content_std_C is not None
     predicted, target = SlotState.split(predicted_BTKD, layout), SlotState.split(target_BTKD, layout)
     off = (predicted.position - target.position) / UNIT
     position_BTK = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none").sum(dim=-1)

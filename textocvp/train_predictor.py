@@ -126,6 +126,8 @@ class Dynamics(nn.Module):
         super().__init__()
         self.text: TextEncoder = model.text
         self.predictor: SlotPredictor = model.predictor
+        if not self.predictor.hears_text:  # several processes would wait for gradients that never come
+            self.text.requires_grad_(False)
 
     def forward(
         self, seen_BTKD: Tensor, words: WordBatch, imagined: int, forgetful_B: Tensor | None = None

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from textocvp.config import PredictorConfig, TextConfig
-from textocvp.predictor import Predictor
+from textocvp.predictor import Predictor, build_predictor
+from textocvp.predictor_base import SlotPredictor
 from textocvp.predictor_layer import color_match
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
@@ -19,10 +20,17 @@ TEXTS = [
 ]
 
 
-def build(attention="causal", layout=EXPLICIT, **changes) -> Predictor:
+every_kind = pytest.mark.parametrize("kind", ["textocvp", "ocvp-seq"])
+both_forms = pytest.mark.parametrize("attention", ["window", "causal"])
+both_layouts = pytest.mark.parametrize("layout", [EXPLICIT, IMPLICIT], ids=["explicit", "implicit"])
+
+
+def build(attention="causal", layout=EXPLICIT, kind="textocvp", **changes) -> SlotPredictor:
     torch.manual_seed(1)
-    sizes = dict(dim=32, layers=3, heads=4, hidden=48, window=8, color_bias=layout.explicit, feed_forwards=1)
-    model = Predictor(PredictorConfig(attention=attention, **{**sizes, **changes}), layout, 32).eval()
+    sizes = dict(dim=32, layers=3, heads=4, hidden=48, window=8, feed_forwards=1)
+    sizes["color_bias"] = layout.explicit and kind == "textocvp"
+    config = PredictorConfig(kind=kind, attention=attention, **{**sizes, **changes})
+    model = build_predictor(config, layout, 32).eval()
     with torch.no_grad():  # random networks barely move: make every path count
         model.slot_out.weight.mul_(5)
     return model
@@ -63,10 +71,11 @@ def test_published_parameter_count(slot_dim, count):
     assert sum(p.numel() for p in model.parameters() if p.requires_grad) == count
 
 
-@pytest.mark.parametrize("attention", ["window", "causal"])
-@pytest.mark.parametrize("layout", [EXPLICIT, IMPLICIT], ids=["explicit", "implicit"])
-def test_slots_are_a_set(attention, layout):
-    model, slots = build(attention, layout), scene(layout)
+@every_kind
+@both_forms
+@both_layouts
+def test_slots_are_a_set(kind, attention, layout):
+    model, slots = build(attention, layout, kind), scene(layout)
     order = torch.randperm(slots.shape[2], generator=torch.Generator().manual_seed(4))
     with torch.no_grad():
         rolled = model.rollout(slots, text(), 3).slots_BSKD
@@ -75,8 +84,9 @@ def test_slots_are_a_set(attention, layout):
     assert (rolled[:, 0] - slots[:, -1]).abs().max() > 0.01
 
 
-def test_causal_frames_do_not_see_the_future():
-    model, slots = build(), scene(frames=6)
+@every_kind
+def test_causal_frames_do_not_see_the_future(kind):
+    model, slots = build(kind=kind), scene(frames=6)
     changed = slots.clone()
     changed[:, 4:, :, : EXPLICIT.content] += 1.0
     with torch.no_grad():
@@ -85,8 +95,9 @@ def test_causal_frames_do_not_see_the_future():
     assert (before[:, 4:] - after[:, 4:]).abs().max() > 0.1
 
 
-def test_forgetful_sequences_see_one_frame_at_a_time():
-    model, slots = build(), scene(frames=4)
+@every_kind
+def test_forgetful_sequences_see_one_frame_at_a_time(kind):
+    model, slots = build(kind=kind), scene(frames=4)
     changed = slots.clone()
     changed[:, 1, :, : EXPLICIT.content] += 1.0
     forgetful = torch.tensor([True, False])
@@ -97,8 +108,9 @@ def test_forgetful_sequences_see_one_frame_at_a_time():
     assert (before[1, 2] - after[1, 2]).abs().max() > 1e-3
 
 
-def test_window_frames_see_each_other_but_nothing_older_than_the_window():
-    model = build("window", window=3)
+@every_kind
+def test_window_frames_see_each_other_but_nothing_older_than_the_window(kind):
+    model = build("window", kind=kind, window=3)
     slots = scene(frames=5)
     changed = slots.clone()
     changed[:, :2, :, : EXPLICIT.content] += 1.0  # older than the window of the first step
@@ -113,22 +125,25 @@ def test_window_frames_see_each_other_but_nothing_older_than_the_window():
         ).abs().max() > 0
 
 
+@every_kind
 @pytest.mark.parametrize("seed_frames", [1, 3])
-@pytest.mark.parametrize("layout", [EXPLICIT, IMPLICIT], ids=["explicit", "implicit"])
-def test_cached_and_uncached_rollouts_agree(layout, seed_frames):
-    model, slots = build(layout=layout), scene(layout, frames=seed_frames)
+@both_layouts
+def test_cached_and_uncached_rollouts_agree(kind, layout, seed_frames):
+    model, slots = build(layout=layout, kind=kind), scene(layout, frames=seed_frames)
+    asked = dict(return_attention=model.hears_text)
     with torch.no_grad():
-        cached = model.rollout(slots, text(), 5, return_attention=True)
-        plain = model.rollout(slots, text(), 5, use_cache=False, return_attention=True)
+        cached = model.rollout(slots, text(), 5, **asked)
+        plain = model.rollout(slots, text(), 5, use_cache=False, **asked)
     torch.testing.assert_close(cached.slots_BSKD, plain.slots_BSKD, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(cached.attention_BSnhKL, plain.attention_BSnhKL, atol=1e-5, rtol=1e-4)
     with_gradients = model.rollout(slots, text(), 5).slots_BSKD  # another cache implementation
     torch.testing.assert_close(with_gradients, cached.slots_BSKD, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("attention", ["window", "causal"])
-def test_one_step_of_a_rollout_is_the_teacher_forced_prediction(attention):
-    model, slots = build(attention), scene(frames=4)
+@every_kind
+@both_forms
+def test_one_step_of_a_rollout_is_the_teacher_forced_prediction(kind, attention):
+    model, slots = build(attention, kind=kind), scene(frames=4)
     with torch.no_grad():
         forced = model(slots, text())[:, -1]
         rolled = model.rollout(slots, text(), 1).slots_BSKD[:, 0]
@@ -144,8 +159,9 @@ def test_text_padding_changes_nothing():
     assert (model.rollout(slots[:1], tokens.select(slice(1, 2)), 3).slots_BSKD - alone).abs().max() > 1e-3
 
 
-def test_color_and_presence_are_carried_and_absent_slots_are_neither_heard_nor_changed():
-    model, slots = build(), scene(absent=2)
+@every_kind
+def test_color_and_presence_are_carried_and_absent_slots_are_neither_heard_nor_changed(kind):
+    model, slots = build(kind=kind), scene(absent=2)
     with torch.no_grad():
         before = model.rollout(slots, text(), 3).slots_BSKD
         slots[:, :, -2:, : EXPLICIT.content + 7] = torch.randn(2, 4, 2, EXPLICIT.content + 7).abs()
@@ -178,16 +194,96 @@ def test_color_match_compares_the_slots_of_a_scene():
     assert (match[0] <= 0).all()  # an absent slot never outdoes the best present one
 
 
-@pytest.mark.parametrize("attention", ["window", "causal"])
-@pytest.mark.parametrize("layout", [EXPLICIT, IMPLICIT], ids=["explicit", "implicit"])
-def test_gradients_flow_through_a_rollout(attention, layout):
-    model = build(attention, layout)
+@every_kind
+@both_forms
+@both_layouts
+def test_gradients_flow_through_a_rollout(kind, attention, layout):
+    model = build(attention, layout, kind)
     slots = scene(layout).requires_grad_()
     model.rollout(slots, text(), 4).slots_BSKD[:, -1].square().sum().backward()
     assert slots.grad[:, 0].abs().max() > 0  # through all steps and the past
     assert [name for name, p in model.named_parameters() if p.grad is None] == []
-    if layout.explicit:
+    if layout.explicit and kind == "textocvp":
         assert all(layer.color_gain_h.grad.abs().max() > 0 for layer in model.layers)
+
+
+@every_kind
+@both_forms
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"layers": layers} for layers in (2, 4, 8)),
+        *({"residual": residual} for residual in (True, False)),
+        *({"age_encoding": encoding} for encoding in ("learned", "sinusoidal")),
+        *({"feed_forwards": nets} for nets in (1, 2)),
+        {"standardize": True},
+    ],
+    ids=lambda changes: "=".join(map(str, *changes.items())),
+)
+def test_every_variant_predicts_learns_and_agrees_with_its_cache(kind, attention, changes):
+    model, slots = build(attention, IMPLICIT, kind, **changes), scene(IMPLICIT)
+    if model.standardized:
+        model.content_mean_C += 3.0
+        model.content_std_C *= 2.0
+    rolled = model.rollout(slots, text(), 4).slots_BSKD
+    rolled.square().sum().backward()
+    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
+    with torch.no_grad():
+        plain = model.rollout(slots, text(), 4, use_cache=False).slots_BSKD
+        torch.testing.assert_close(rolled, plain, atol=1e-4, rtol=1e-3)
+        model.slot_out.weight.zero_()
+        model.slot_out.bias.zero_()
+        silent = model.rollout(slots, text(), 4).slots_BSKD
+        still = slots[:, -1:] if model.config.residual else torch.zeros(())
+        assert torch.equal(silent, still.expand_as(silent))
+
+
+def test_a_variant_has_the_parameters_that_it_says():
+    def count(**changes) -> int:
+        return sum(p.numel() for p in build(layout=IMPLICIT, **changes).parameters())
+
+    feed_forward = 2 * 32 * 48 + 48 + 32 + 2 * 32
+    attention = 4 * 32 * 32 + 2 * 32
+    text_attention = 4 * 32 * 32 + 32 + 4 * 32
+    assert count() - count(layers=2) == attention + text_attention + feed_forward
+    assert count(feed_forwards=2) - count() == 3 * feed_forward
+    assert count() - count(age_encoding="sinusoidal") == 8 * 32
+    assert count(attention="window") - count() == 32
+    assert count(residual=False) == count(standardize=True) == count()
+    seq = count(kind="ocvp-seq", feed_forwards=2)
+    assert seq - count(kind="ocvp-seq", feed_forwards=2, layers=2) == 2 * (attention + feed_forward)
+
+
+def test_in_units_of_its_deviation_a_predictor_is_deaf_to_the_scale_of_the_slots():
+    model, slots = build(layout=IMPLICIT, standardize=True), scene(IMPLICIT)
+    with torch.no_grad():
+        before = model.rollout(slots, text(), 3).slots_BSKD
+        model.content_mean_C += 3.0
+        model.content_std_C *= 50.0
+        after = model.rollout(slots * 50.0 + 3.0, text(), 3).slots_BSKD
+    torch.testing.assert_close(after, before * 50.0 + 3.0, atol=1e-3, rtol=1e-3)
+
+
+def test_ocvp_seq_hears_no_text_but_other_slots_and_their_past():
+    model, slots = build(kind="ocvp-seq"), scene(frames=4)
+    with torch.no_grad():
+        told = model.rollout(slots, text(), 3).slots_BSKD
+        assert torch.equal(told, model.rollout(slots, text(TEXTS[::-1]), 3).slots_BSKD)
+        slots[:, 1, 3, : EXPLICIT.content] += 1.0
+        moved = (model.rollout(slots, text(), 1).slots_BSKD - told[:, :1]).abs().amax(dim=(0, 1, 3))
+    assert (moved[:5] > 1e-6).all() and moved[5:].max() == 0
+    with pytest.raises(ValueError, match="no attention to its words"):
+        model.rollout(slots, text(), 1, return_attention=True)
+
+
+def test_a_slot_that_comes_late_does_not_hear_its_own_absence():
+    model, slots = build(kind="ocvp-seq"), scene(absent=0)
+    slots[:, :2, -1, -1] = 0
+    with torch.no_grad():
+        before = model.rollout(slots, text(), 2).slots_BSKD
+        slots[:, :2, -1, :-1] += 1.0
+        after = model.rollout(slots, text(), 2).slots_BSKD
+    torch.testing.assert_close(before, after)
 
 
 def test_bad_input_is_named():
@@ -204,5 +300,10 @@ def test_bad_input_is_named():
         model(slots[:1], text())
     with pytest.raises(ValueError, match="explicit"):
         build(layout=IMPLICIT, color_bias=True)
-    with pytest.raises(ValueError, match="heads"):
-        build(heads=5)
+    with pytest.raises(ValueError, match="'ocvp-seq' hears none"):
+        build(kind="ocvp-seq", color_bias=True)
+    with pytest.raises(ValueError, match="known: textocvp, ocvp-seq"):
+        build(kind="crystal-ball")
+    for kind in ("textocvp", "ocvp-seq"):
+        with pytest.raises(ValueError, match="heads"):
+            build(kind=kind, heads=5)

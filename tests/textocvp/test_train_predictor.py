@@ -11,7 +11,7 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import ModelConfig, TextConfig
+from textocvp.config import ModelConfig, PredictorConfig, TextConfig
 from textocvp.episodes import EpisodeFile
 from textocvp.following import FollowingTest, Thing, ask, things_of
 from textocvp.model import TextOCVP
@@ -23,6 +23,13 @@ from textocvp.text import build_text_encoder
 from textocvp.train_predictor import Dynamics, Lesson, PredictorTraining, next_lesson, train, true_frames
 
 LAYOUT = SlotLayout(content=4)
+OCVP_SEQ = replace(
+    PLACED,
+    name="tiny-ocvp-seq",
+    predictor=PredictorConfig(
+        kind="ocvp-seq", dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8
+    ),
+)
 
 
 def scenes(episodes: int = 12, frames: int = 6, slots: int = 5) -> SlotCache:
@@ -73,7 +80,7 @@ def weights(out: Path) -> dict[str, torch.Tensor]:
     return TextOCVP.from_pretrained(out / "checkpoint").state_dict()
 
 
-@pytest.mark.parametrize("config", [PLACED, PUBLISHED], ids=lambda config: config.name)
+@pytest.mark.parametrize("config", [PLACED, PUBLISHED, OCVP_SEQ], ids=lambda config: config.name)
 def test_a_killed_run_continues_exactly(run, config, monkeypatch):
     straight, resumed = run(config, "straight"), run(config, "resumed", save_minutes=0.0)
     train(straight)
@@ -102,6 +109,13 @@ def test_a_killed_run_continues_exactly(run, config, monkeypatch):
         if not torch.equal(a[name], tensor)
     }
     assert changed == {"text", "predictor"}  # parser and renderer are frozen
+
+
+def test_nothing_teaches_a_text_encoder_that_nobody_hears(run):
+    train(run(OCVP_SEQ, "short", steps=1))
+    train(run(OCVP_SEQ, "long", steps=3))
+    a, b = (weights(run(OCVP_SEQ, name).out) for name in ("short", "long"))
+    assert {name.split(".")[0] for name in a if not torch.equal(a[name], b[name])} == {"predictor"}
 
 
 def test_image_loss_reaches_the_predictor_through_the_frozen_renderer(run):
