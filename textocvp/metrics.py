@@ -264,3 +264,34 @@ def bootstrap_interval(
     means = array[rng.integers(len(array), size=(resamples, len(array)))].mean(axis=1)
     low, high = np.quantile(means, [0.5 - confidence / 2, 0.5 + confidence / 2])
     return Interval(float(array.mean()), float(low), float(high), len(array))
+
+
+def relative_change(
+    values: Any, reference: Any, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """How much larger the mean of one set of scenes is than that of another: mean / reference mean - 1.
+
+    The two sets are other scenes, so each is drawn again on its own for the percentile bootstrap interval. A resample
+    whose reference mean is 0 is left out.
+
+    Args:
+        values, reference: (N,) and (M,), one value for each independent thing; nan values are left out.
+        confidence, resamples, seed: of the interval.
+
+    Returns:
+        the change, 0.1 for 10 % more; its n is that of the smaller set.
+
+    Raises:
+        ValueError: if a set is empty or the mean of `reference` is 0.
+    """
+    sets = [np.asarray(a, dtype=np.float64).ravel() for a in (values, reference)]
+    new, old = (a[~np.isnan(a)] for a in sets)
+    if len(new) == 0 or len(old) == 0:
+        raise ValueError("no values to take a mean of")
+    if old.mean() == 0:
+        raise ValueError("a change relative to a mean of 0 is not defined")
+    rng = np.random.default_rng(seed)
+    new_S, old_S = (a[rng.integers(len(a), size=(resamples, len(a)))].mean(axis=1) for a in (new, old))
+    changes = new_S[old_S != 0] / old_S[old_S != 0] - 1
+    low, high = np.quantile(changes, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    return Interval(float(new.mean() / old.mean() - 1), float(low), float(high), min(len(new), len(old)))

@@ -15,6 +15,7 @@ from textocvp.metrics import (
     foreground_ari,
     object_ious,
     psnr,
+    relative_change,
     slot_labels,
     ssim,
     wilson_interval,
@@ -212,3 +213,24 @@ def test_bootstrap_repeats_and_leaves_nan_out():
     assert bootstrap_interval(values).n == 3
     with pytest.raises(ValueError, match="no values"):
         bootstrap_interval([float("nan")])
+
+
+def test_relative_change_by_hand():
+    found = relative_change([0.3, 0.5, float("nan")], [0.25, 0.25, 0.25, 0.25])
+    assert found.value == pytest.approx(0.6) and found.n == 2
+    # Resamples of two values are 0.3, 0.4 or 0.5, and the reference never changes.
+    assert (found.low, found.high) == pytest.approx((0.2, 1.0))
+    with pytest.raises(ValueError, match="mean of 0"):
+        relative_change([1.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="no values"):
+        relative_change([], [1.0])
+
+
+def test_relative_change_covers_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for trial in range(200):
+        new, old = rng.normal(3.0, 0.5, size=40), rng.normal(2.0, 0.5, size=30)
+        interval = relative_change(new, old, resamples=400, seed=trial)
+        covered += interval.low <= 0.5 <= interval.high
+    assert 0.88 <= covered / 200 <= 0.98
