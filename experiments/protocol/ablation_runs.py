@@ -7,8 +7,15 @@ the same number of updates; all parser runs share episodes, order and updates li
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
+
+from textocvp.config import ModelConfig, preset, with_settings
+from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, read_config
+from textocvp.training import STEP_FILE
 
 Stage = Literal["parser", "predictor"]
 Group = Literal["reference", "depth", "residual", "text", "initializer and decoder"]
@@ -38,6 +45,16 @@ class AblationRun:
     label: str
     preset: str = "tabletop-small"
     settings: tuple[str, ...] = ()
+
+    @property
+    def config(self) -> ModelConfig:
+        """What it must have been trained with."""
+        return with_settings(preset(self.preset), self.settings)
+
+    @property
+    def command(self) -> str:
+        """What to type to train it."""
+        return f"python experiments/train_ablations.py --only {self.name}"
 
 
 NO_BIAS = "predictor.color_bias=false"
@@ -110,3 +127,73 @@ def run_named(name: str) -> AblationRun:
         if run.name == name:
             return run
     raise KeyError(f"unknown run {name!r}; known: {', '.join(run.name for run in RUNS)}")
+
+
+# Part of the configuration that tells where weights were found, not what the model is.
+WHERE_FROM = {"text.weights", "text.fingerprint"}
+PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """What there is of a run.
+
+    Attributes:
+        run: which.
+        folder: of the run.
+        state: `trained`; `unfinished` (it stopped before its end); `missing`; or `other settings`.
+        detail: for `other settings`, which.
+        updates: how many updates it had, where that is known.
+    """
+
+    run: AblationRun
+    folder: Path
+    state: Literal["trained", "unfinished", "missing", "other settings"]
+    detail: str = ""
+    updates: int | None = None
+
+    @property
+    def checkpoint(self) -> Path:
+        """Folder of the trained model."""
+        return self.folder / "checkpoint"
+
+
+def find_run(run: AblationRun, runs: Path) -> FoundRun:
+    """Look for a run in the folder of all runs.
+
+    Raises:
+        CheckpointError: if its configuration is damaged.
+    """
+    folder = runs / run.name
+    checkpoint, figures = folder / "checkpoint", folder / FIGURES[run.stage]
+    if not all(path.is_file() for path in (checkpoint / CONFIG_FILE, checkpoint / WEIGHTS_FILE, figures)):
+        return FoundRun(run, folder, "unfinished" if (folder / "state").exists() else "missing")
+    other = differences(run, read_config(checkpoint))
+    if other:
+        return FoundRun(run, folder, "other settings", "; ".join(other))
+    step = folder / "state" / STEP_FILE
+    updates = int(json.loads(step.read_text())["next_step"]) if step.is_file() else None
+    return FoundRun(run, folder, "trained", updates=updates)
+
+
+FIGURES = {"parser": "quality.json", "predictor": "following.json"}
+"""The file that each stage of training writes last."""
+
+
+def differences(run: AblationRun, config: ModelConfig) -> list[str]:
+    """How a trained model's settings differ from the run's, one sentence each."""
+    wanted, found = (_flat(one.to_dict(), PARTS[run.stage]) for one in (run.config, config))
+    return [
+        f"{name} is {found.get(name)}, wanted {value}"
+        for name, value in wanted.items()
+        if found.get(name) != value and name not in WHERE_FROM
+    ]
+
+
+def _flat(data: Mapping[str, Any], parts: tuple[str, ...]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for part in parts:
+        for name, value in data[part].items():
+            inner = value.items() if isinstance(value, Mapping) else [("", value)]
+            flat |= {f"{part}.{name}" + (f".{key}" if key else ""): one for key, one in inner}
+    return flat
