@@ -6,7 +6,8 @@ trained on it, and the planner grounds slots by their looks (`planning`)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -205,8 +206,10 @@ class FollowingTest:
         steps = self.slots_ETKD.shape[1] - 1
         for at in range(0, len(episodes), self.batch):
             chosen = list(episodes[at : at + self.batch])
-            text = model.text(sentences[at : at + self.batch])
-            imagined = model.predictor.rollout(self.slots_ETKD[chosen, :1].to(model.device), text, steps)
+            seed = self.slots_ETKD[chosen, :1].to(model.device)
+            with _evaluating(model):
+                text = model.text(sentences[at : at + self.batch])
+                imagined = model.predictor.rollout(seed, text, steps)
             last = SlotState.split(imagined.slots_BSKD[:, -1].float().cpu(), self.layout)
             ends.update(zip(chosen, last.position, strict=True))
         return ends
@@ -219,6 +222,18 @@ class FollowingTest:
         if block < 0 or bowl is None or bowl < 0:
             return False
         return float((ends_K2[block] - self._place(episode, 0, bowl)).norm()) < REACHED
+
+
+@contextmanager
+def _evaluating(model: TextOCVP) -> Iterator[None]:
+    """The model in evaluation mode, and afterwards each part in the mode that it was in."""
+    training = [module for module in model.modules() if module.training]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def _share(outcomes: Iterable[bool]) -> float:

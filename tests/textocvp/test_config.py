@@ -29,7 +29,7 @@ def test_settings_reach_the_field_they_name_and_no_other() -> None:
     ("setting", "message"),
     [
         ("predictor.layers", "part.field=value"),
-        ("predictor.depth=2", "no field 'depth'; known: dim, layers"),
+        ("predictor.depth=2", "no field 'depth'; known: kind, dim, layers"),
         ("brain.layers=2", "no field 'brain'"),
         ("predictor.layers=two", "type int"),
         ("predictor.layers=2.5", "type int"),

@@ -275,6 +275,7 @@ class _Obedient(torch.nn.Module):
         self.places = places
 
     def text(self, sentences):
+        assert not self.training  # a fine-tuned T5 has dropout
         return list(sentences)
 
     @property
@@ -304,7 +305,9 @@ def test_following_asks_and_judges():
     original, other = "put the red block in the blue bowl", "put the red block in the green bowl"
     assert (question.original, question.other, question.wrong) == (original, other, other)
     test = FollowingTest(slots, [question], LAYOUT)
-    obedient = test.measure(_Obedient({original: (1, 2), other: (1, 3)}))
+    model = _Obedient({original: (1, 2), other: (1, 3)})
+    obedient = test.measure(model)
+    assert model.training
     assert (obedient.original, obedient.other_bowl, obedient.wrong_text, obedient.grounded) == (1, 1, 0, 1)
     deaf = test.measure(_Obedient({original: (1, 2), other: (1, 2)}))
     assert (deaf.original, deaf.other_bowl, deaf.wrong_text) == (1, 0, 1)
