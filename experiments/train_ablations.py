@@ -26,6 +26,7 @@ from rich.console import Console
 
 from experiments.protocol.ablation_runs import (
     PARSER_BATCH,
+    PARSER_CLIP,
     PARSER_STEPS,
     PREDICTOR_BATCH,
     PREDICTOR_STEPS,
@@ -128,6 +129,7 @@ def train(run: AblationRun, args: Args, parser: Path) -> None:
                 set=run.settings,
                 steps=args.parser_steps,
                 batch=PARSER_BATCH,
+                clip=PARSER_CLIP,
                 warmup=min(ParserTraining.warmup, args.parser_steps // 4),
                 episodes=args.episodes or ParserTraining.episodes,
                 seed=args.seed,

@@ -22,8 +22,9 @@ Group = Literal["reference", "depth", "residual", "text", "initializer and decod
 
 PREDICTOR_STEPS = 500
 PREDICTOR_BATCH = 32
-PARSER_STEPS = 1500
+PARSER_STEPS = 600
 PARSER_BATCH = 16
+PARSER_CLIP = 2
 
 
 @dataclass(frozen=True)
