@@ -138,7 +138,26 @@ def read_config(folder: Path) -> ModelConfig:
     """The configuration of the checkpoint in `folder`.
 
     Raises:
-        CheckpointError: if there is no readable `config.json` there, or a field is unknown or missing.
+        CheckpointError: if there is no readable `config.json` there, it is of another architecture, or a field is
+            unknown or missing.
+    """
+    data = read_json(folder)
+    if "architecture" in data:
+        raise CheckpointError(
+            f"{folder} holds a {data['architecture']!r} model, which has no slots: load it with "
+            "textocvp.video.load_video_model"
+        )
+    try:
+        return ModelConfig.from_dict(data)
+    except ValueError as error:
+        raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
+
+
+def read_json(folder: Path) -> dict[str, Any]:
+    """What `config.json` of the checkpoint in `folder` holds, whatever its architecture.
+
+    Raises:
+        CheckpointError: if there is no readable `config.json` there.
     """
     path = folder / CONFIG_FILE
     try:
@@ -152,10 +171,7 @@ def read_config(folder: Path) -> ModelConfig:
         raise CheckpointError(f"{path} is damaged: {error}") from error
     if not isinstance(data, dict):
         raise CheckpointError(f"{path} is damaged: it must hold one JSON object, not a {type(data).__name__}")
-    try:
-        return ModelConfig.from_dict(data)
-    except ValueError as error:
-        raise CheckpointError(f"{path}: {error}") from error
+    return data
 
 
 def load_weights(model: nn.Module, path: Path) -> None:
