@@ -148,13 +148,16 @@ class EpisodeFile:
         """
         return [self._open()["frames"][self._rows(int(index))] for index in indices]
 
-    def random_clips(self, rng: np.random.Generator, count: int, length: int) -> NDArray[np.uint8]:
+    def random_clips(
+        self, rng: np.random.Generator, count: int, length: int, rows: slice = slice(None)
+    ) -> NDArray[np.uint8]:
         """Random clips (count, length, H, W, 3); every clip of the file is equally likely.
 
         Args:
             rng: the source of chance; the same state gives the same clips.
             count: how many, at least 1.
             length: frames of each, at least 1.
+            rows: read only these of the `count` clips, for a process that computes a share of a batch.
 
         Raises:
             ValueError: when no episode is that long.
@@ -166,11 +169,11 @@ class EpisodeFile:
         if len(self) == 0 or ends[-1] == 0:
             longest = int(self.lengths.max(initial=0))
             raise ValueError(f"no episode has {length} frames; the longest of {self.path} has {longest}")
-        picks = rng.integers(ends[-1], size=count)
+        picks = rng.integers(ends[-1], size=count)[rows]
         episodes = np.searchsorted(ends, picks, side="right")
         offsets = picks - (ends[episodes] - np.maximum(self.lengths[episodes] - length + 1, 0))
         starts = self._starts[episodes] + offsets
-        clips = np.empty((count, length, self.image_size, self.image_size, 3), dtype=np.uint8)
+        clips = np.empty((len(picks), length, self.image_size, self.image_size, 3), dtype=np.uint8)
         dataset = self._open()["frames"]
         # In the file's order, so that clips of one chunk are read while it is cached.
         for place in np.argsort(starts):

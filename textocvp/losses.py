@@ -32,6 +32,10 @@ class ParserLoss:
         """The weighted sum that is minimised."""
         return self.image + mask_weight * self.mask + place_weight * self.place
 
+    def figures(self) -> dict[str, Tensor]:
+        """The terms, named for a log."""
+        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
+
 
 def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
     """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things.
@@ -43,28 +47,43 @@ def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) 
     return 1 + thing_weight * thing.to(target.dtype)
 
 
-def image_loss(rendered: Rendered, target: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean squared error of the composed frames against frames (B, 3, H, W)."""
-    return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * weights.sum())
+def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tensor | None = None) -> Tensor:
+    """Weighted mean squared error of the composed frames against frames (B, 3, H, W).
+
+    Args:
+        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
+            up to that of the batch.
+    """
+    whole = weights.sum() if whole is None else whole
+    return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * whole)
 
 
-def mask_loss(rendered: Rendered, attention_BKHW: Tensor, weights: Tensor) -> Tensor:
+def mask_loss(
+    rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None
+) -> Tensor:
     """Weighted cross-entropy of the drawn masks against the attention's winners; no gradient enters the attention.
 
     The renderer sees only the slots, the attention also the pixels: agreeing with it teaches the renderer where a
     slot ends long before the image loss alone would, and without labels (self-distillation, as in SPOT, 2024).
+    `whole` is as in `image_loss`.
     """
     log_masks = rendered.masks_BKHW.clamp_min(1e-6).log()
     per_pixel = F.nll_loss(log_masks, attention_BKHW.argmax(1), reduction="none")
-    return (weights[:, 0] * per_pixel).sum() / weights.sum()
+    return (weights[:, 0] * per_pixel).sum() / (weights.sum() if whole is None else whole)
 
 
 def place_loss(expected: SlotState, found: SlotState) -> Tensor:
-    """Mean squared error of expected places and log-sizes, over the things; no gradient enters `found`."""
+    """Mean squared error of expected places and log-sizes, over the things of each clip, then over the clips (B, T, K).
+
+    No gradient enters `found`.
+    """
     wanted = torch.cat([found.position, found.scale.log()], dim=-1).detach()
     error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
     things = found.is_thing[..., 0]
-    return torch.where(things, error, torch.zeros_like(error)).sum() / things.sum().clamp_min(1)
+    error_B = torch.where(things, error, torch.zeros_like(error)).sum((1, 2)) / things.sum((1, 2)).clamp_min(
+        1
+    )
+    return error_B.mean()
 
 
 def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Tensor) -> Tensor:

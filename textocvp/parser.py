@@ -8,6 +8,7 @@ subclass's business.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ class SceneParser(nn.Module):
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> Parsed:
         """Parse clips.
 
@@ -57,14 +58,15 @@ class SceneParser(nn.Module):
             frames_BT3HW: frames in -1..1, of the size the parser was built for.
             num_slots: how many slots to use, background included; the configured number by default.
             generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by
-                default.
+                default. One for each clip, on any device: what is drawn for a clip then does not depend on
+                which others are parsed with it.
         """
         raise NotImplementedError
 
 
-def to_frames(clips: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+def to_frames(clips: np.ndarray | Tensor, device: torch.device | str = "cpu") -> Tensor:
     """Clips (B, T, H, W, 3) uint8 as the model's frames (B, T, 3, H, W), float in -1..1."""
-    return torch.from_numpy(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
+    return torch.as_tensor(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1
 
 
 def build_parser(config: ParserConfig) -> SceneParser:

@@ -11,6 +11,8 @@ channels of the video are permuted: that is what lets training recolour whole sc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -193,7 +195,7 @@ class PlacedParser(SceneParser):
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> Parsed:
         """Parse clips; see `SceneParser.forward`. Nothing is drawn at random here: `generator` changes nothing."""
         state, attention = self.first(frames_BT3HW[:, 0], num_slots or self.config.num_slots)

@@ -40,6 +40,12 @@ class SlotBatch:
     def to(self, device: torch.device | str) -> SlotBatch:
         return replace(self, slots_BTKD=self.slots_BTKD.to(device), words=self.words.to(device))
 
+    def select(self, rows: slice) -> SlotBatch:
+        """A sub-batch."""
+        return SlotBatch(
+            self.slots_BTKD[rows], self.words.select(rows), self.episodes_B[rows], self.channels_B3[rows]
+        )
+
 
 class SlotBatches:
     """Draws training batches from a slot cache held in memory.

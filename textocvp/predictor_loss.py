@@ -35,9 +35,9 @@ class SlotLoss:
         """The weighted sum that is minimised."""
         return self.position + scale_weight * self.scale + content_weight * self.content
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Tensor]:
         """The terms, named for a log."""
-        return {f"loss/{name}": getattr(self, name).item() for name in self.__dataclass_fields__}
+        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
 
 
 def slot_loss(
@@ -46,6 +46,8 @@ def slot_loss(
     weights_BTK: Tensor,
     layout: SlotLayout,
     content_std_C: Tensor | None,
+    *,
+    whole: Tensor | float | None = None,
 ) -> SlotLoss:
     """Compare predicted slots with the parser's.
 
@@ -53,8 +55,10 @@ def slot_loss(
         weights_BTK: how much each slot counts, see `moving_weights`.
         content_std_C: standard deviation of each content channel over the training slots; None for slots without
             explicit channels that are compared as they are.
+        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
+            up to that of the batch.
     """
-    weights_BTK = weights_BTK / weights_BTK.sum().clamp(min=1e-6)
+    weights_BTK = weights_BTK / (weights_BTK.sum().clamp(min=1e-6) if whole is None else whole)
     if not layout.explicit:
         error_BTKD = predicted_BTKD - target_BTKD
         if content_std_C is not None:

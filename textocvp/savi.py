@@ -6,6 +6,8 @@ frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -71,8 +73,18 @@ class GaussianInitializer(nn.Module):
         self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
         self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
 
-    def forward(self, batch: int, num_slots: int, generator: torch.Generator | None = None) -> Tensor:
+    def forward(
+        self,
+        batch: int,
+        num_slots: int,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
         """(batch, num_slots, D) slots."""
+        if isinstance(generator, Sequence):
+            noise_KD = [
+                torch.randn(num_slots, self.mean.shape[0], generator=g, device=g.device) for g in generator
+            ]
+            return self.mean + self.log_deviation.exp() * torch.stack(noise_KD).to(self.mean)
         noise_BKD = torch.randn(
             batch,
             num_slots,
@@ -198,7 +210,7 @@ class SaviParser(SceneParser):
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> Parsed:
         B, T = frames_BT3HW.shape[:2]
         K = self.config.num_slots if num_slots is None else num_slots

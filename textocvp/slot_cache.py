@@ -125,27 +125,51 @@ def cached_slots(model: TextOCVP, episodes: EpisodeFile, path: Path, *, batch: i
     Raises:
         SlotCacheError: if `path` holds the slots of another parser or of other episodes.
     """
-    parser, source = parser_fingerprint(model), episodes_fingerprint(episodes)
     if path.exists():
-        return _checked(SlotCache.load(path), path, parser, source)
-    folder = path.with_name(path.name + ".parts")
-    firsts = range(0, len(episodes), PART)
+        return _checked(SlotCache.load(path), path, parser_fingerprint(model), episodes_fingerprint(episodes))
+    whole = _joined(_parts(model, episodes, path, 0, 1, batch))
+    whole.save(path)
+    shutil.rmtree(_folder(path))
+    return whole
+
+
+def parse_share(
+    model: TextOCVP, episodes: EpisodeFile, path: Path, process: int, processes: int, *, batch: int = 16
+) -> None:
+    """Parse every `processes`-th part, from part number `process` on, for one of them to join with `cached_slots`.
+
+    Raises:
+        SlotCacheError: as `cached_slots`.
+    """
+    if processes > 1 and not path.exists():
+        _parts(model, episodes, path, process, processes, batch)
+
+
+def _folder(path: Path) -> Path:
+    return path.with_name(path.name + ".parts")
+
+
+def _parts(
+    model: TextOCVP, episodes: EpisodeFile, path: Path, process: int, processes: int, batch: int
+) -> list[SlotCache]:
+    """The parts that are this process's, each read if it is there, else parsed and written."""
+    parser, source = parser_fingerprint(model), episodes_fingerprint(episodes)
+    firsts = range(0, len(episodes), PART)[process::processes]
     parts = []
-    with tqdm(total=len(episodes), desc=f"parsing {path.stem}", unit="episode") as bar:
+    with tqdm(
+        total=len(firsts), desc=f"parsing {path.stem}", unit=f"{PART} episodes", disable=process > 0
+    ) as bar:
         for first in firsts:
-            chosen = range(first, min(first + PART, len(episodes)))
-            part_path = folder / f"{first:06d}.h5"
+            part_path = _folder(path) / f"{first:06d}.h5"
             if part_path.exists():
                 part = _checked(SlotCache.load(part_path), part_path, parser, source)
             else:
+                chosen = range(first, min(first + PART, len(episodes)))
                 part = _parse(model, episodes, chosen, parser, source, batch)
                 part.save(part_path)
             parts.append(part)
-            bar.update(len(chosen))
-    whole = _joined(parts)
-    whole.save(path)
-    shutil.rmtree(folder)
-    return whole
+            bar.update()
+    return parts
 
 
 @torch.no_grad()

@@ -14,64 +14,49 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
 import torch
 from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
-from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.config import ModelConfig, PredictorConfig, preset, with_settings
+from textocvp.config import ModelConfig, preset, with_settings
 from textocvp.episodes import EpisodeFile
 from textocvp.following import Following, FollowingTest, following_questions
+from textocvp.lessons import Exercise, exercise
+from textocvp.longer_window import grow_window
 from textocvp.model import TextOCVP
 from textocvp.predictor_base import SlotPredictor
 from textocvp.predictor_data import SlotBatches, true_frames
-from textocvp.predictor_loss import moving_weights, slot_loss
-from textocvp.slot_cache import SlotCache, cached_slots
+from textocvp.predictor_loss import slot_loss
+from textocvp.slot_cache import SlotCache, cached_slots, parse_share
 from textocvp.text import TextEncoder, WordBatch
-from textocvp.training import load_state, save_state, start, step_rng
+from textocvp.training import Run, SettingsError, TrainingSettings, start
 
 
-@dataclass
-class PredictorTraining:
+@dataclass(kw_only=True)
+class PredictorTraining(TrainingSettings):
     """Train the text encoder and the predictor on the slots of a trained parser (stage 2)."""
 
     parser: Path
     """Checkpoint folder with the trained parser and renderer, from `textocvp train parser`."""
-    data: Path
-    """Training episodes."""
-    val: Path
-    """Held-out episodes, for the figures."""
-    out: Path
-    """Folder of the run. If it holds an unfinished run, that run goes on."""
-    episodes: int | None = None
-    """Train on the first so many episodes of the file only."""
     finetune: bool = False
-    """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones."""
+    """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
+    `--set predictor.window=40` they learn longer rollouts."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
-    set: tuple[str, ...] = ()
-    """Settings of text encoder and predictor to change, each part.field=value: `--set predictor.layers=2`."""
     steps: int = 1100
-    """Updates."""
     batch: int = 32
-    """Episodes an update."""
+    """Episodes an update, shared out among the processes."""
+    learning_rate: float = 1e-3
+    evaluate_every: int = 250
+    evaluate_episodes: int = 200
     autoregressive: float = 0.4
     """Share of the updates, the last ones, that learn from imagined frames (`window`: all do)."""
     horizon: int = 4
     """Frames of the first rollouts; grows linearly to the whole episode at four fifths of these updates."""
-    learning_rate: float = 1e-3
-    """Peak of the cosine schedule."""
-    warmup: int = 100
-    """Updates until the peak."""
-    clip_norm: float = 1.0
-    """Largest gradient norm."""
     moving: float = 20.0
     """How much more a slot counts that moves."""
     scale_weight: float = 0.1
@@ -94,29 +79,6 @@ class PredictorTraining:
     """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
     image_frames: int = 2
     """How many frames of each rollout are drawn for it."""
-    precision: Literal["no", "bf16", "fp16"] = "no"
-    """Mixed precision."""
-    seed: int = 0
-    """Seed of weights and data order."""
-    evaluate_every: int = 250
-    """Updates between figures."""
-    evaluate_episodes: int = 200
-    """Held-out episodes they are measured on; the final figures use all."""
-    save_minutes: float = 4.0
-    """Minutes between saved states."""
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """What one update trains.
-
-    Attributes:
-        seen: how many true frames are given, from the first on.
-        imagined: how many frames the model adds to them itself.
-    """
-
-    seen: int
-    imagined: int
 
 
 class Dynamics(nn.Module):
@@ -156,11 +118,16 @@ def train(args: PredictorTraining) -> Following | None:
     Raises:
         CheckpointError: if `parser` is no checkpoint.
         SlotCacheError: if `out` holds slots of another parser or of other episodes.
+        SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
     model = assemble(args).to(accelerator.device)
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        for file, name in ((episodes, "train"), (held_out, "val")):
+            share = (accelerator.process_index, accelerator.num_processes)
+            parse_share(model, file, args.out / f"slots-{name}.h5", *share)
+        accelerator.wait_for_everyone()
         with accelerator.main_process_first():
             cache = cached_slots(model, episodes, args.out / "slots-train.h5")
             val_cache = cached_slots(model, held_out, args.out / "slots-val.h5")
@@ -181,6 +148,7 @@ def train(args: PredictorTraining) -> Following | None:
             questions = following_questions(val_cache, held_out, layout)
             test = FollowingTest(val_cache.padded(batches.frames).float(), questions, layout)
         following = fit(args, accelerator, model, batches, test, episodes if args.image_weight > 0 else None)
+    accelerator.wait_for_everyone()
     accelerator.end_training()
     return following
 
@@ -189,13 +157,17 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     """A model with the trained parser and renderer, frozen, and a text encoder and a predictor to train.
 
     Raises:
-        ValueError: if an option would change the architecture of what is to be fine-tuned.
+        SettingsError: if an option would change the architecture of what is to be fine-tuned (but for a longer window),
+            or of the parser.
     """
     trained = TextOCVP.from_pretrained(args.parser)
     if args.finetune:
-        for option in ("preset", "set"):
-            if getattr(args, option):
-                raise ValueError(f"finetune keeps the checkpoint's architecture: leave out {option}")
+        if args.preset is not None:
+            raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
+        try:
+            grow_window(trained, args.set)
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
         for part in (trained.parser, trained.renderer):
             part.requires_grad_(False)
         return trained
@@ -207,7 +179,7 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     config = dataclasses.replace(config, text=dataclasses.replace(config.text, fingerprint=""))
     for setting in args.set:
         if not setting.startswith(("predictor.", "text.")):
-            raise ValueError(
+            raise SettingsError(
                 f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
             )
     model = TextOCVP(with_settings(config, args.set))
@@ -244,62 +216,32 @@ def fit(
     layout = model.config.parser.layout
     std_C = None
     if model.predictor.standardized:
-        mean_C, std_C = batches.content_statistics()
-        model.predictor.content_mean_C.copy_(mean_C)
-        model.predictor.content_std_C.copy_(std_C)
+        if not args.finetune:  # else the units that it was trained in stay
+            mean_C, std_C = batches.content_statistics()
+            model.predictor.content_mean_C.copy_(mean_C)
+            model.predictor.content_std_C.copy_(std_C)
         std_C = model.predictor.content_std_C
-    dynamics = Dynamics(model)
-    optimizer = torch.optim.Adam(dynamics.parameters(), lr=args.learning_rate)
-    schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)
-    dynamics, optimizer, schedule = accelerator.prepare(dynamics, optimizer, schedule)
-    first = load_state(accelerator, args.out)
+    run = Run(args, accelerator, Dynamics(model))
+    for step in run.steps("predictor"):
+        mine = exercise(args, model.config.predictor, batches, step).select(run.rows).to(run.device)
+        for part in run.parts():
+            task = mine.select(part)
+            asked = (task.seen_BTKD, task.batch.words, task.lesson.imagined, task.forgetful_B)
+            predicted_BSKD = run.module(*asked).float()
+            loss = slot_loss(predicted_BSKD, task.true_BSKD, task.weights_BSK, layout, std_C, whole=1.0)
+            total = loss.total(args.scale_weight, args.content_weight)
+            if episodes is not None:
+                drawn = image_error(model, episodes, task, predicted_BSKD)
+                total = total + args.image_weight * run.share(part) * drawn
+            run.backward(total, loss.figures())
+        run.update(step, {"horizon": 1.0 + mine.lesson.imagined})
 
-    saved = time.monotonic()
-    bar = tqdm(range(first, args.steps), initial=first, total=args.steps, desc="predictor", unit="step")
-    for step in bar:
-        rng = step_rng(args.seed, step, accelerator.process_index)
-        batch = batches.draw(rng, args.batch).to(accelerator.device)
-        lesson = next_lesson(args, model.config.predictor, step, batches.frames, rng)
-        with accelerator.autocast():
-            seen_BTKD = batches.noisy(rng, batch.slots_BTKD[:, : lesson.seen])
-            forgetful_B = torch.from_numpy(rng.random(args.batch) < args.forgetful).to(accelerator.device)
-            predicted_BSKD = dynamics(seen_BTKD, batch.words, lesson.imagined, forgetful_B).float()
-        last = lesson.seen + lesson.imagined  # the number of the last frame that was predicted
-        first_predicted = last + 1 - predicted_BSKD.shape[1]
-        true_BTKD = batch.slots_BTKD[:, first_predicted - 1 : last + 1]
-        weights_BSK = moving_weights(true_BTKD, layout, args.moving, ever=lesson.imagined > 0)
-        loss = slot_loss(predicted_BSKD, true_BTKD[:, 1:], weights_BSK, layout, std_C)
-        total = loss.total(args.scale_weight, args.content_weight)
-        if episodes is not None:
-            drawn_BS = rng.integers(predicted_BSKD.shape[1], size=(args.batch, args.image_frames))
-            slots_BSKD = predicted_BSKD[torch.arange(args.batch)[:, None], torch.from_numpy(drawn_BS)]
-            target_BS3HW = true_frames(episodes, batch, first_predicted + drawn_BS).to(accelerator.device)
-            frames = model.renderer(slots_BSKD.flatten(0, 1)).frames_B3HW
-            total = total + args.image_weight * (frames - target_BS3HW.flatten(0, 1)).square().mean()
-        accelerator.backward(total)
-        norm = accelerator.clip_grad_norm_(dynamics.parameters(), args.clip_norm)
-        optimizer.step()
-        schedule.step()
-        optimizer.zero_grad()
-
-        if step % 20 == 0:
-            figures = {
-                "loss/total": total.item(),
-                "gradient_norm": float(norm),
-                "horizon": 1.0 + lesson.imagined,
-            }
-            accelerator.log(figures | loss.figures(), step=step)
-            bar.set_postfix(place=f"{loss.position.item():.3f}", content=f"{loss.content.item():.3f}")
-        if test is not None and (step + 1) % args.evaluate_every == 0 and accelerator.is_main_process:
+        if test is not None and run.is_main and (step + 1) % args.evaluate_every == 0:
             following = test.measure(model, args.evaluate_episodes)
-            accelerator.log(following.figures(), step=step)
+            run.log(step, following.figures())
             tqdm.write(f"step {step + 1}: {following}")
-        if time.monotonic() - saved > 60 * args.save_minutes:
-            save_state(accelerator, args.out, step + 1)
-            saved = time.monotonic()
 
-    save_state(accelerator, args.out, args.steps)
-    if not accelerator.is_main_process:
+    if not run.is_main:
         return None
     model.save_pretrained(args.out / "checkpoint")
     if test is None:
@@ -310,16 +252,10 @@ def fit(
     return following
 
 
-def next_lesson(
-    args: PredictorTraining, predictor: PredictorConfig, step: int, frames: int, rng: np.random.Generator
-) -> Lesson:
-    """The lesson of update number `step`, for episodes of `frames` frames."""
-    begin = round(args.steps * (1 - args.autoregressive)) if predictor.attention == "causal" else 0
-    if step < begin:
-        return Lesson(frames - 1, 0)
-    grown = min(1.0, (step - begin) / max(1.0, 0.8 * (args.steps - begin)))
-    longest = min(frames - 1, args.horizon + round(grown * (frames - 1 - args.horizon)))
-    horizon = int(rng.integers((longest + 1) // 2, longest + 1))
-    if predictor.attention == "causal":
-        return Lesson(frames - horizon, horizon - 1)
-    return Lesson(int(rng.integers(1, frames - horizon + 1)), horizon - 1)
+def image_error(model: TextOCVP, episodes: EpisodeFile, task: Exercise, predicted_BSKD: Tensor) -> Tensor:
+    """Mean squared error of the frames that `task` wants drawn; its gradient flows through the frozen renderer."""
+    chosen_BF = torch.from_numpy(task.drawn_BF).to(predicted_BSKD.device)
+    slots_BFKD = predicted_BSKD[torch.arange(len(chosen_BF))[:, None], chosen_BF]
+    target_BF3HW = true_frames(episodes, task.batch, task.first + task.drawn_BF).to(predicted_BSKD.device)
+    frames = model.renderer(slots_BFKD.flatten(0, 1)).frames_B3HW
+    return (frames - target_BF3HW.flatten(0, 1)).square().mean()

@@ -11,16 +11,18 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
+from textocvp import training
 from textocvp.config import ModelConfig, PredictorConfig, TextConfig
 from textocvp.episodes import EpisodeFile
 from textocvp.following import FollowingTest, Thing, ask, things_of
+from textocvp.lessons import Lesson, next_lesson
 from textocvp.model import TextOCVP
 from textocvp.predictor_data import SlotBatches
 from textocvp.predictor_loss import moving_weights, slot_loss
 from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
-from textocvp.train_predictor import Dynamics, Lesson, PredictorTraining, next_lesson, train, true_frames
+from textocvp.train_predictor import Dynamics, PredictorTraining, train, true_frames
 
 LAYOUT = SlotLayout(content=4)
 OCVP_SEQ = replace(
@@ -85,9 +87,7 @@ def test_a_killed_run_continues_exactly(run, config, monkeypatch):
     straight, resumed = run(config, "straight"), run(config, "resumed", save_minutes=0.0)
     train(straight)
 
-    import textocvp.train_predictor as module
-
-    save, lost = module.save_state, []
+    save, lost = training.save_state, []
 
     def killed_after_two(accelerator, out, next_step):
         save(accelerator, out, next_step)
@@ -95,7 +95,7 @@ def test_a_killed_run_continues_exactly(run, config, monkeypatch):
             lost.append(True)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "save_state", killed_after_two)
+    monkeypatch.setattr(training, "save_state", killed_after_two)
     with pytest.raises(KeyboardInterrupt):
         train(resumed)
     torch.rand(7)  # the world goes on
@@ -139,7 +139,7 @@ def test_options_replace_the_checkpoints_choices(run):
 
 
 def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained():
-    args = PredictorTraining(Path(), Path(), Path(), Path(), steps=1000, autoregressive=0.4, horizon=4)
+    args = PredictorTraining(Path(), Path(), Path(), parser=Path(), steps=1000, autoregressive=0.4, horizon=4)
     given = [
         next_lesson(args, PLACED.predictor, step, 25, np.random.default_rng(step)) for step in range(1000)
     ]
