@@ -135,6 +135,21 @@ def draw(env: gym.Env[Any, Any], scene: TestScene, variants: int = 0) -> Drawn:
     return Drawn(scene, observation, info, tuple(texts))
 
 
+def wrong_text(drawn: Drawn) -> str:
+    """A sentence about the scene that names another block and another bowl than its own, as far as there are any.
+
+    A scene always has another block or another bowl. Which is named is a function of the scene's seed alone.
+    """
+    (pair,) = parse_instruction(drawn.texts[0])
+    rng = np.random.default_rng([drawn.scene.seed, 3])
+    named = {}
+    for kind, own in (("block", pair.block), ("bowl", pair.bowl)):
+        colors = sorted(item["color"] for item in drawn.info["objects"] if item["kind"] == kind)
+        others = [color for color in colors if color != own]
+        named[kind] = others[int(rng.integers(len(others)))] if others else own
+    return format_instruction([(named["block"], named["bowl"])])
+
+
 @dataclass(frozen=True, eq=False)
 class Played:
     """What the expert did.
