@@ -121,24 +121,27 @@ def _train(arguments: list[str]) -> None:
     # never use.
     from textocvp import train_parser, train_predictor
     from textocvp.episodes import EpisodeFile
+    from textocvp.mage import train_vqvae
+    from textocvp.mage.config import mage_preset
     from textocvp.slot_cache import SlotCacheError
 
     Stage = Union[  # noqa: UP007
         Annotated[train_parser.ParserTraining, tyro.conf.subcommand("parser")],
         Annotated[train_predictor.PredictorTraining, tyro.conf.subcommand("predictor")],
+        Annotated[train_vqvae.VQVAETraining, tyro.conf.subcommand("vqvae")],
     ]
     chosen: Any = tyro.cli(
         Stage,
         prog="textocvp train",
-        description="Train in two stages: the parser on frames, then the predictor on its slots. Both "
-        "show their progress, log to TensorBoard (OUT/logs), and go on where they stopped when they are "
-        "started again.",
+        description="Train in two stages: the parser on frames, then the predictor on its slots; or for the "
+        "baseline MAGE the VQ-VAE on frames, then the transformer on its codes. All show their progress, log to "
+        "TensorBoard (OUT/logs), and go on where they stopped when they are started again.",
         args=arguments,
     )
     # What can be known to be wrong is said at once, before anything is built or written.
     try:
         if chosen.preset is not None:
-            preset(chosen.preset)
+            (mage_preset if isinstance(chosen, train_vqvae.VQVAETraining) else preset)(chosen.preset)
         for path in (chosen.data, chosen.val):
             EpisodeFile(path).close()
     except KeyError as error:
@@ -147,6 +150,8 @@ def _train(arguments: list[str]) -> None:
         raise Mistake(str(error)) from error
     if isinstance(chosen, train_parser.ParserTraining):
         train_parser.train(chosen)
+    elif isinstance(chosen, train_vqvae.VQVAETraining):
+        train_vqvae.train(chosen)
     else:
         try:
             train_predictor.train(chosen)

@@ -1,0 +1,230 @@
+"""MAGE, stage 1: train the VQ-VAE to redraw frames from codes.
+
+    textocvp train vqvae --data data/tabletop-train.h5 --val data/tabletop-val.h5 --out runs/vqvae
+
+The loss is the squared error of the redrawn frame, things weighted above the canvas, plus the two terms that draw codes
+and features to each other ("Neural Discrete Representation Learning" 2017, equation 3).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from textocvp.config import with_settings
+from textocvp.episodes import EpisodeFile
+from textocvp.loading import read_ahead
+from textocvp.losses import thing_weights
+from textocvp.mage.checkpoint import save_vqvae
+from textocvp.mage.config import mage_preset
+from textocvp.mage.vqvae import VQVAE, perplexity
+from textocvp.metrics import psnr
+from textocvp.parser import to_frames
+from textocvp.training import Run, TrainingSettings, start, step_rng
+
+
+@dataclass(kw_only=True)
+class VQVAETraining(TrainingSettings):
+    """Train the VQ-VAE of MAGE (stage 1)."""
+
+    preset: str = "mage-small"
+    """Architecture; `textocvp models` lists the presets."""
+    steps: int = 2000
+    batch: int = 8
+    """Clips an update, shared out among the processes."""
+    learning_rate: float = 2e-3
+    warmup: int = 100
+    workers: int = 0
+    """Processes (beside each training process) that read clips ahead."""
+    clip: int = 4
+    """Frames a clip."""
+    stride: int = 6
+    """Episode frames between two frames of a clip, drawn from 1 to this."""
+    thing_weight: float = 4.0
+    """How much more a pixel that is not canvas counts."""
+    commitment: float = 2.0
+    """Weight of the term that draws features to their codes (published)."""
+    restart_every: int = 25
+    """Updates after which codes that none of them used are put where the features are."""
+    restart_until: float = 0.7
+    """Share of the updates after which codes are left where they are."""
+
+
+@dataclass(frozen=True)
+class Redrawn:
+    """How well held-out frames are redrawn.
+
+    Attributes:
+        psnr: mean peak signal-to-noise ratio of the frames, in dB.
+        thing_psnr: the same over the pixels that are not canvas.
+        perplexity: how many codes are used, effectively.
+        codes: how many codes are used at all.
+    """
+
+    psnr: float
+    thing_psnr: float
+    perplexity: float
+    codes: int
+
+    def __str__(self) -> str:
+        return (
+            f"redrawn at {self.psnr:.2f} dB, things at {self.thing_psnr:.2f} dB; {self.codes} codes used, "
+            f"perplexity {self.perplexity:.0f}"
+        )
+
+
+class CodeUses:
+    """How often each code was used since codes were last restarted; part of a run's saved state."""
+
+    def __init__(self, codes: int) -> None:
+        self.counts_K = torch.zeros(codes, dtype=torch.int64)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"counts_K": self.counts_K}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.counts_K = state["counts_K"]
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Reads the frames of a step, in whichever process.
+
+    Attributes:
+        episodes: the training episodes.
+        args: the stage's settings.
+        rows: of the step's clips, those to read.
+    """
+
+    episodes: EpisodeFile
+    args: VQVAETraining
+    rows: slice
+
+    def __call__(self, step: int) -> Tensor:
+        """(B, T, H, W, 3) uint8."""
+        args, rng = self.args, step_rng(self.args.seed, step)
+        stride = int(rng.integers(1, args.stride + 1))
+        clips = self.episodes.random_clips(rng, args.batch, (args.clip - 1) * stride + 1, self.rows)
+        return torch.from_numpy(clips[:, ::stride].copy())
+
+
+def train(args: VQVAETraining) -> Redrawn | None:
+    """Run or continue stage 1; writes `out`/checkpoint and returns the figures on the held-out episodes.
+
+    They are None on all processes but the main one.
+
+    Raises:
+        SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
+    """
+    accelerator = start(args.out, args.precision)
+    torch.manual_seed(args.seed)
+    model = VQVAE(with_settings(mage_preset(args.preset), args.set).vqvae).to(accelerator.device)
+    uses = CodeUses(model.config.codebook_size)
+    accelerator.register_for_checkpointing(uses)
+    run, redrawn = Run(args, accelerator, model), None
+    with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        batches = read_ahead(
+            FrameReader(episodes, args, run.rows), range(run.first, args.steps), args.workers
+        )
+        for step, clips in zip(run.steps("vqvae"), batches, strict=True):
+            if step % args.restart_every == 0 and step <= args.restart_until * args.steps:
+                # Every process looks at the same whole batch, so that all of them move the same codes alike.
+                restart_codes(model, uses, FrameReader(episodes, args, slice(None))(step), args.seed + step)
+            frames_BT3HW = to_frames(clips, run.device)
+            weights_BT1HW = thing_weights(frames_BT3HW, args.thing_weight)
+            whole = run.total(weights_BT1HW.sum())
+            counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64, device=run.device)
+            for part in run.parts():
+                frames_N3HW, weights_N1HW = (
+                    frames_BT3HW[part].flatten(0, 1),
+                    weights_BT1HW[part].flatten(0, 1),
+                )
+                with accelerator.autocast():
+                    drawn_N3HW, found = run.module(frames_N3HW)
+                image = (weights_N1HW * (drawn_N3HW - frames_N3HW).square()).sum() / (3 * whole)
+                codebook, commitment = (
+                    run.share(part) * term for term in (found.codebook_loss, found.commitment_loss)
+                )
+                run.backward(
+                    image + codebook + args.commitment * commitment,
+                    {"loss/image": image, "loss/commitment": commitment},
+                )
+                counts_K += found.codes_Nhw.flatten().bincount(minlength=len(counts_K))
+            counts_K = run.total(counts_K).cpu()
+            uses.counts_K += counts_K
+            run.update(step, {"perplexity": perplexity(counts_K)})
+
+            if run.is_main and (step + 1) % args.evaluate_every == 0:
+                redrawn = measure(model, held_out, range(min(args.evaluate_episodes, len(held_out))))
+                run.log(step, {f"val/{name}": value for name, value in asdict(redrawn).items()})
+                tqdm.write(f"step {step + 1}: {redrawn}")
+                draw_samples(model, held_out, range(4), args.out / "samples" / f"{step + 1:06d}.png")
+        if run.is_main:
+            save_vqvae(model, args.out / "checkpoint")
+            redrawn = measure(model, held_out, range(len(held_out)))
+            print(f"final: {redrawn}")
+            (args.out / "redrawn.json").write_text(json.dumps(asdict(redrawn), indent=2) + "\n")
+    accelerator.wait_for_everyone()
+    accelerator.end_training()
+    return redrawn
+
+
+@torch.no_grad()
+def restart_codes(model: VQVAE, uses: CodeUses, clips_BTHW3: Tensor, seed: int) -> int:
+    """Put the unused codes onto features of these frames and begin to count anew; how many there were."""
+    device = model.codebook.codes_KC.device
+    features_XC = model.features(to_frames(clips_BTHW3, device).flatten(0, 1)).flatten(0, 2)
+    generator = torch.Generator().manual_seed(seed)
+    moved = model.codebook.restart((uses.counts_K == 0).to(device), features_XC, generator)
+    uses.counts_K = torch.zeros_like(uses.counts_K)
+    return moved
+
+
+@torch.no_grad()
+def measure(model: VQVAE, episodes: EpisodeFile, chosen: Iterable[int], frame_step: int = 3) -> Redrawn:
+    """Figures over every so many-th frame of some episodes."""
+    device = model.codebook.codes_KC.device
+    ratios, errors, weights = [], [], []
+    counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64)
+    for index in chosen:
+        frames_N3HW = to_frames(episodes.episode(index).frames[None, ::frame_step], device)[0]
+        codes_Nhw = model.encode(frames_N3HW)
+        counts_K += codes_Nhw.flatten().bincount(minlength=len(counts_K)).cpu()
+        real, drawn = (frames_N3HW + 1) / 2, (model.decode(codes_Nhw).clamp(-1, 1) + 1) / 2
+        ratios.append(psnr(drawn, real))
+        thing_N1HW = thing_weights(frames_N3HW, 1.0) - 1
+        errors.append((thing_N1HW * (drawn - real).square()).sum() / 3)
+        weights.append(thing_N1HW.sum())
+    error = torch.stack(errors).sum() / torch.stack(weights).sum().clamp_min(1)
+    return Redrawn(
+        psnr=float(torch.cat(ratios).mean()),
+        thing_psnr=float(-10 * error.log10()),
+        perplexity=perplexity(counts_K),
+        codes=int((counts_K > 0).sum()),
+    )
+
+
+@torch.no_grad()
+def draw_samples(
+    model: VQVAE, episodes: EpisodeFile, chosen: Iterable[int], path: Path, columns: int = 8
+) -> None:
+    """A picture with two rows an episode: frames, and the same redrawn from their codes."""
+    rows = []
+    for index in chosen:
+        frames = episodes.episode(index).frames
+        frames = frames[np.linspace(0, len(frames) - 1, columns).round().astype(int)]
+        redrawn = model.decode(model.encode(to_frames(frames[None], model.codebook.codes_KC.device)[0]))
+        drawn = (
+            ((redrawn.clamp(-1, 1) + 1) * 127.5).round().permute(0, 2, 3, 1).cpu().numpy().astype(np.uint8)
+        )
+        rows += [np.concatenate(list(strip), axis=1) for strip in (frames, drawn)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, np.concatenate(rows).repeat(2, 0).repeat(2, 1))
