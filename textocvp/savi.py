@@ -54,6 +54,11 @@ class ConvEncoder(nn.Module):
             nn.Conv2d(channels, channels, 5, padding=2),
             nn.ReLU(),
         )
+        for module in self.convolutions:
+            if isinstance(module, nn.Conv2d):
+                # PyTorch's own initialisation shrinks the picture layer by layer, until the position code drowns it.
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
             nn.LayerNorm(channels), nn.Linear(channels, out_dim), nn.ReLU(), nn.Linear(out_dim, out_dim)
@@ -141,13 +146,13 @@ class SlotAttention(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
 
     def forward(
-        self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, first_BKL: Tensor | None = None
+        self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, given_BKL: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
         slots.
 
         Args:
-            first_BKL: the first iteration's attention, if it is known already (clusters); sums to 1 over the slots.
+            given_BKL: the attention of all iterations, where it is known (clusters); sums to 1 over the slots.
 
         Raises:
             ValueError: if `iterations` is below 1.
@@ -157,9 +162,9 @@ class SlotAttention(nn.Module):
         B, K, D = slots_BKD.shape
         features_BLD = self.norm_features(features_BLD)
         keys_BLD, values_BLD = self.key(features_BLD), self.value(features_BLD)
-        for iteration in range(iterations):
-            if iteration == 0 and first_BKL is not None:
-                attention_BKL = first_BKL
+        for _ in range(iterations):
+            if given_BKL is not None:
+                attention_BKL = given_BKL
             else:
                 queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
                 attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
@@ -176,7 +181,8 @@ class SaviParser(SceneParser):
     """Slot attention for video over clips.
 
     Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
-    unless the same generator state is given.
+    unless the same generator state is given. With `cluster` the clusters are the attention on the first frame, and
+    slots compete for locations from the second frame on.
 
     Raises:
         ValueError: if the layout has explicit channels (this corrector gives content only), or the

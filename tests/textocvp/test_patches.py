@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
 from textocvp.config import ModelConfig, RendererConfig, preset, with_settings
-from textocvp.losses import read_place_loss
+from textocvp.losses import read_place_loss, thing_weights
 from textocvp.model import TextOCVP
 from textocvp.patches import MIN_SCALE, PatchDecoder, PatchRenderer, gaussian_prior, position_code
 from textocvp.placed import moments
@@ -127,7 +127,7 @@ def test_stage_one_reaches_every_parameter(initializer: str, prior: str) -> None
     frames = torch.full((2, 2, 3, 32, 32), -0.6)
     frames[:, :, 0, 4:12, 4:12] = 0.8
     frames[:, :, 2, 18:26, 10:16] = 0.8
-    loss = parser_loss(model, frames, 4.0)
+    loss = parser_loss(model, frames, thing_weights(frames.flatten(0, 1), 4.0))
     assert (loss.place > 0) == (prior == "true") and loss.mask == 0
     loss.total(0.1, 0.1).backward()
     for name, parameter in [*model.parser.named_parameters(), *model.renderer.named_parameters()]:
@@ -136,7 +136,7 @@ def test_stage_one_reaches_every_parameter(initializer: str, prior: str) -> None
 
 def test_clusters_are_the_first_attention() -> None:
     torch.manual_seed(0)
-    model = TextOCVP(small("parser.initializer=cluster", "parser.iterations_first=1"))
+    model = TextOCVP(small("parser.initializer=cluster", "parser.iterations_first=3"))
     frames = torch.full((1, 1, 3, 32, 32), -0.6)
     frames[..., 0, 4:12, 4:12] = 0.8
     with torch.no_grad():
