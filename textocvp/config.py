@@ -29,12 +29,13 @@ class ParserConfig:
         encoder_channels: width of the convolutional encoder.
         encoder_stride: stride of its first convolution.
         iterations_first, iterations_next: corrector iterations on the first and on later frames.
-        corrector: `slot_attention` (published) or `placed` (invariant slot attention with explicit colour, place
-            and size; needs `layout.explicit`).
+        corrector: `slot_attention` (published), `placed` (invariant slot attention with explicit colour, place
+            and size; needs `layout.explicit`) or `holistic` (no slots: one vector a frame, for Non-OC).
         transition_heads, transition_hidden: the transformer block between frames.
         glimpse_size, glimpse_extent: cells of the canonical picture in which the `placed` corrector reads a slot, and
             how many standard deviations it reaches to each side.
         hidden: width of the `placed` corrector's fully connected layers.
+        pool_cells: cells along a side of the frame whose features `holistic` averages: 1 as published.
     """
 
     image_size: int = 64
@@ -45,12 +46,13 @@ class ParserConfig:
     encoder_stride: int = 1
     iterations_first: int = 1
     iterations_next: int = 1
-    corrector: Literal["slot_attention", "placed"] = "placed"
+    corrector: Literal["slot_attention", "placed", "holistic"] = "placed"
     transition_heads: int = 4
     transition_hidden: int = 128
     glimpse_size: int = 24
     glimpse_extent: float = 2.6
     hidden: int = 256
+    pool_cells: int = 1
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,10 @@ class RendererConfig:
 
     Attributes:
         kind: `broadcast` (spatial broadcast decoder, published), `glimpse` (a small canonical picture a slot,
-            placed at the slot's position and scale over a background canvas; needs `layout.explicit`) or `patches`
-            (an MLP draws patch by patch).
-        channels: width of the decoder's convolutions (`broadcast` only).
-        hidden: width of the decoder's fully connected layers (all but `broadcast`).
+            placed at the slot's position and scale over a background canvas; needs `layout.explicit`), `patches`
+            (an MLP draws patch by patch) or `upsample` (one slot is the whole frame, for Non-OC).
+        channels: width of the decoder's convolutions (`broadcast` and `upsample` only).
+        hidden: width of the decoder's fully connected layers (`glimpse` and `patches` only).
         glimpse_size: side of the canonical picture in cells (`glimpse` only).
         glimpse_extent: how many standard deviations the glimpse reaches to each side (`glimpse` only).
         patches: patches along a side of the frame (`patches` only).
@@ -71,7 +73,7 @@ class RendererConfig:
             of its mask (`patches` only).
     """
 
-    kind: Literal["broadcast", "glimpse", "patches"] = "glimpse"
+    kind: Literal["broadcast", "glimpse", "patches", "upsample"] = "glimpse"
     channels: int = 32
     hidden: int = 256
     glimpse_size: int = 24
@@ -315,6 +317,33 @@ PRESETS["ocvp-seq"] = replace(
     predictor=PredictorConfig(
         kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal"
     ),
+)
+
+# Non-OC, the same predictor over one slot a frame: beside the shipped model, and at its published size.
+PRESETS["non-oc-small"] = ModelConfig(
+    name="non-oc-small",
+    parser=ParserConfig(
+        num_slots=1, layout=SlotLayout(content=256, explicit=False), corrector="holistic", pool_cells=4
+    ),
+    renderer=RendererConfig(kind="upsample"),
+    predictor=PredictorConfig(
+        dim=128,
+        layers=3,
+        heads=4,
+        hidden=256,
+        attention="causal",
+        window=24,
+        feed_forwards=1,
+        standardize=True,
+    ),
+)
+PRESETS["non-oc"] = replace(
+    PRESETS["savi-cater"],
+    name="non-oc",
+    parser=ParserConfig(
+        num_slots=1, layout=SlotLayout(content=512, explicit=False), corrector="holistic", encoder_channels=64
+    ),
+    renderer=RendererConfig(kind="upsample", channels=64),
 )
 
 

@@ -37,7 +37,7 @@ def with_longer_window(predictor: SlotPredictor, window: int) -> SlotPredictor:
         reached = predictor.ages.detach()[: config.window]
         grown.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(rows - config.window, -1)]))
     else:
-        grown.ages = sinusoids(rows, config.dim).to(predictor.ages.device)
+        grown.register_buffer("ages", sinusoids(rows, config.dim).to(predictor.ages.device), persistent=False)
     return grown
 
 

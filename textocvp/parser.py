@@ -84,4 +84,10 @@ def build_parser(config: ParserConfig) -> SceneParser:
         from textocvp.placed import PlacedParser
 
         return PlacedParser(config)
-    raise ValueError(f"unknown parser.corrector {config.corrector!r}; known: slot_attention, placed")
+    if config.corrector == "holistic":
+        from textocvp.holistic import HolisticParser
+
+        return HolisticParser(config)
+    raise ValueError(
+        f"unknown parser.corrector {config.corrector!r}; known: slot_attention, placed, holistic"
+    )

@@ -25,6 +25,8 @@ GATES = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
 class ParserQuality:
     """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval.
 
+    A model with one slot has one mask, in which no object can be found or followed: all but its PSNR is None.
+
     Attributes:
         object_miou: IoU of drawn masks with blocks and bowls, Hungarian matching a frame.
         object_found: share of blocks and bowls with an IoU above one half.
@@ -33,25 +35,34 @@ class ParserQuality:
         psnr: of the redrawn frames, dB.
     """
 
-    object_miou: Interval
-    object_found: Interval
-    followed: Interval
-    foreground_ari: Interval
+    object_miou: Interval | None
+    object_found: Interval | None
+    followed: Interval | None
+    foreground_ari: Interval | None
     psnr: Interval
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {getattr(self, name)}" for name in self.__dataclass_fields__)
+        text = ", ".join(f"{name} {interval}" for name, interval in self._measured().items())
+        return text if self.object_miou is not None else f"{text} (one slot: there are no masks to measure)"
+
+    def _measured(self) -> dict[str, Interval]:
+        named = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+        return {name: interval for name, interval in named if interval is not None}
 
     def figures(self) -> dict[str, float]:
         """The values alone, named for a log."""
-        return {f"quality/{name}": getattr(self, name).value for name in self.__dataclass_fields__}
+        return {f"quality/{name}": interval.value for name, interval in self._measured().items()}
 
     def missed_gates(self) -> list[str]:
-        """A sentence for each figure below its gate; empty for a parser that is good enough."""
+        """A sentence for each figure below its gate; empty for a parser that is good enough.
+
+        The gates are for slots that are things, so a model with one slot misses none.
+        """
+        measured = self._measured()
         return [
-            f"{name} is {getattr(self, name).value:.3f}, below its gate of {gate:.2f}"
+            f"{name} is {measured[name].value:.3f}, below its gate of {gate:.2f}"
             for name, gate in GATES.items()
-            if getattr(self, name).value < gate
+            if name in measured and measured[name].value < gate
         ]
 
     def to_json(self) -> str:
@@ -77,6 +88,10 @@ def measure_parser(
         frames = to_frames(episode.frames[None], model.device)[0]
         slots = model.parser(frames[None]).slots_BTKD[0]
         rendered = model.renderer(slots)
+        drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
+        psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())
+        if slots.shape[1] == 1:
+            continue
         labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
         # The arm (1) is not an object: as background it matches nothing.
         objects = np.where(episode.segmentation == 1, 0, episode.segmentation)
@@ -86,6 +101,7 @@ def measure_parser(
         found.append((matches > 0.5).mean())
         follows.append(followed(labels, objects).mean())
         aris.append(np.mean([foreground_ari(labels[t], episode.segmentation[t]) for t in times]))
-        drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
-        psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())
-    return ParserQuality(*(bootstrap_interval(values) for values in (ious, found, follows, aris, psnrs)))
+    miou, share, kept, ari = (
+        bootstrap_interval(values) if values else None for values in (ious, found, follows, aris)
+    )
+    return ParserQuality(miou, share, kept, ari, bootstrap_interval(psnrs))

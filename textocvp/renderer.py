@@ -77,4 +77,8 @@ def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) 
         from textocvp.patches import PatchRenderer
 
         return PatchRenderer(config, layout, image_size)
-    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse, patches")
+    if config.kind == "upsample":
+        from textocvp.upsample import UpsampleRenderer
+
+        return UpsampleRenderer(config, layout, image_size)
+    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse, patches, upsample")

@@ -191,7 +191,10 @@ def train(args: ParserTraining) -> ParserQuality | None:
 def draw_samples(
     model: TextOCVP, episodes: EpisodeFile, chosen: Iterable[int], path: Path, columns: int = 8
 ) -> None:
-    """A picture with three rows an episode: frames, frames redrawn from their slots, and the slots' masks."""
+    """A picture with three rows an episode: frames, frames redrawn from their slots, and the slots' masks.
+
+    One slot has no mask worth a row.
+    """
     rows = []
     for index in chosen:
         episode = episodes.episode(index)
@@ -200,8 +203,10 @@ def draw_samples(
         rendered = model.renderer(slots)
         drawn_BHW3 = ((rendered.frames_B3HW.clamp(-1, 1) + 1) * 127.5).permute(0, 2, 3, 1)
         drawn = drawn_BHW3.cpu().numpy().astype(np.uint8)
-        masks = color_masks(rendered.masks_BKHW.cpu().numpy())
-        for strip in (episode.frames[times], drawn, masks):
+        strips = [episode.frames[times], drawn]
+        if slots.shape[1] > 1:
+            strips.append(color_masks(rendered.masks_BKHW.cpu().numpy()))
+        for strip in strips:
             rows.append(np.concatenate(list(strip), axis=1))
     picture = np.concatenate(rows).repeat(2, 0).repeat(2, 1)
     path.parent.mkdir(parents=True, exist_ok=True)
