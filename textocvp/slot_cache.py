@@ -157,7 +157,7 @@ def _parts(
     firsts = range(0, len(episodes), PART)[process::processes]
     parts = []
     with tqdm(
-        total=len(firsts), desc=f"parsing {path.stem}", unit=f"{PART} episodes", disable=process > 0
+        total=len(firsts), desc=f"parsing {path.stem}", unit="part", disable=process > 0
     ) as bar:
         for first in firsts:
             part_path = _folder(path) / f"{first:06d}.h5"

@@ -28,7 +28,7 @@ from textocvp.model import TextOCVP
 from textocvp.parser import to_frames
 from textocvp.parser_quality import ParserQuality, measure_parser
 from textocvp.slots import SlotState
-from textocvp.training import Run, TrainingSettings, start, step_rng
+from textocvp.training import Run, TrainingSettings, finish, start, step_rng
 
 
 @dataclass(kw_only=True)
@@ -182,8 +182,7 @@ def train(args: ParserTraining) -> ParserQuality | None:
             for sentence in quality.missed_gates():
                 print(f"not good enough to train a predictor on: {sentence}")
             (args.out / "quality.json").write_text(quality.to_json())
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
+    finish(accelerator)
     return quality
 
 

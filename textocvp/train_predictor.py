@@ -33,7 +33,7 @@ from textocvp.predictor_data import SlotBatches, true_frames
 from textocvp.predictor_loss import slot_loss
 from textocvp.slot_cache import SlotCache, cached_slots, parse_share
 from textocvp.text import TextEncoder, WordBatch
-from textocvp.training import Run, SettingsError, TrainingSettings, start
+from textocvp.training import Run, SettingsError, TrainingSettings, finish, start
 
 
 @dataclass(kw_only=True)
@@ -148,8 +148,7 @@ def train(args: PredictorTraining) -> Following | None:
             questions = following_questions(val_cache, held_out, layout)
             test = FollowingTest(val_cache.padded(batches.frames).float(), questions, layout)
         following = fit(args, accelerator, model, batches, test, episodes if args.image_weight > 0 else None)
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
+    finish(accelerator)
     return following
 
 

@@ -10,6 +10,7 @@ So a run is the same run on one process or on many, in one part or in many, stop
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import shutil
@@ -31,6 +32,7 @@ from accelerate import (
     DistributedDataParallelKwargs,
     InitProcessGroupKwargs,
 )
+from accelerate.state import AcceleratorState
 from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
@@ -112,8 +114,24 @@ def start(out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: b
             DistributedDataParallelKwargs(find_unused_parameters=some_unused),
         ],
     )
+    if accelerator.num_processes > 1:
+        atexit.register(_part)
     accelerator.init_trackers("training")
     return accelerator
+
+
+def _part() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+
+
+def finish(accelerator: Accelerator) -> None:
+    """Close the log when all processes are done; another run may `start` afterwards, also in another precision."""
+    accelerator.wait_for_everyone()
+    # Not `end_training`, which parts the processes: they could not meet again for the next run of a study.
+    for tracker in accelerator.trackers:
+        tracker.finish()
+    AcceleratorState._reset_state()
 
 
 def step_rng(seed: int, step: int) -> np.random.Generator:
