@@ -142,14 +142,15 @@ class FoundRun:
     Attributes:
         run: which.
         folder: of the run.
-        state: `trained`; `unfinished` (it stopped before its end); `missing`; or `other settings`.
-        detail: for `other settings`, which.
+        state: `trained`; `unfinished` (it stopped before its end); `missing`; `other settings` than the run's; or
+            `unusable` (it cannot be loaded here).
+        detail: for the last two, which or why.
         updates: how many updates it had, where that is known.
     """
 
     run: AblationRun
     folder: Path
-    state: Literal["trained", "unfinished", "missing", "other settings"]
+    state: Literal["trained", "unfinished", "missing", "other settings", "unusable"]
     detail: str = ""
     updates: int | None = None
 

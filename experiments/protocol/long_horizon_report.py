@@ -167,9 +167,20 @@ def _cards(results: Results) -> list[Card]:
 
 def _plot(rows: Sequence[Row], metric: str, name: str, label: str) -> Figure:
     found = {(r.method, r.variant): (r.value, r.low, r.high) for r in rows if r.metric == metric}
-    methods = ("ours, replanning", "ours, one plan", "random order, one plan", "random sequence, one plan")
+    short = {
+        "ours, replanning": ("replanning", 0),
+        "ours, one plan": ("one plan", 3),
+        "random order, one plan": ("random order", 1),
+        "random sequence, one plan": ("random steps", 2),
+    }
     series = [
-        Series(method, [found.get((method, column)) for column in COLUMNS], color=color)
-        for method, color in zip(methods, (0, 3, 1, 2), strict=True)
+        Series(title, [found.get((method, column)) for column in COLUMNS], color=color)
+        for method, (title, color) in short.items()
     ]
-    return interval_plot(name, COLUMNS, series, label=label, caption="Dots with 95 % intervals over scenes.")
+    return interval_plot(
+        name,
+        COLUMNS,
+        series,
+        label=label,
+        caption="Dots with 95 % intervals over scenes; all but the first carry out one plan.",
+    )

@@ -14,6 +14,7 @@ from experiments.protocol.workers import Worker
 from planning import (
     Grounding,
     GroundingError,
+    Imagines,
     Instruction,
     Judge,
     PinholeCamera,
@@ -119,6 +120,26 @@ class PredictedScene:
             imagined_TV=first.block_bowl_Bt.T.numpy(),
             true_TV=_same_length([trace.block_bowl_Bt[0] for trace in true]),
         )
+
+
+def imagine_and_judge(
+    world_model: Imagines, rgb_HW3: np.ndarray, camera: PinholeCamera, texts: Sequence[str], seed: int
+) -> tuple[Rollout, Verdicts, Verdicts]:
+    """Imagine one scene with V instructions and one slot seed.
+
+    Returns:
+        the rollouts, one an instruction; the verdicts of each on its own instruction; and those on the next one of the
+        list, for which it was not imagined. Both (1, V).
+    """
+    instructions = [Instruction.parse(text) for text in texts]
+    parsed = world_model.parse(rgb_HW3[None], seed=seed)
+    rollout = world_model.rollout(parsed, list(texts), horizon=HORIZON, seed=seed)
+    grounding = _ground(rollout, camera, instructions)
+    ours, wrong = (
+        _stack([_judge(_trace(rollout, grounding, asked))])
+        for asked in (instructions, instructions[1:] + instructions[:1])
+    )
+    return rollout, ours, wrong
 
 
 def _ground(rollout: Rollout, camera: PinholeCamera, instructions: list[Instruction]) -> Grounding | None:

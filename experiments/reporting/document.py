@@ -102,6 +102,7 @@ class Report:
         cards: headline figures.
         sections: the rest.
         command: what to type to get the same figures again.
+        again: how far they will be the same.
     """
 
     title: str
@@ -110,6 +111,9 @@ class Report:
     cards: Sequence[Card]
     sections: Sequence[Section]
     command: str
+    again: str = (
+        "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
+    )
 
     def to_html(self) -> str:
         """The page, with every image inside it."""
