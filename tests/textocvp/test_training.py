@@ -1,0 +1,181 @@
+"""Training at scale: the same run on one process or several, in one part or many, read by workers, stopped or not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from tests.textocvp import both_stages
+from tests.textocvp.conftest import PLACED, PUBLISHED
+from textocvp import cli, train_parser, train_predictor, training
+from textocvp.config import PRESETS
+from textocvp.episodes import EpisodeFile
+from textocvp.loading import read_ahead
+from textocvp.model import TextOCVP
+from textocvp.train_parser import ClipReader, ParserTraining
+from textocvp.train_predictor import PredictorTraining
+from textocvp.training import Run, SettingsError
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Toy episodes and a checkpoint of each family; the tiny presets are known by name."""
+    both_stages.write_inputs(tmp_path)
+    for config in (PLACED, PUBLISHED):
+        monkeypatch.setitem(PRESETS, config.name, config)
+    return tmp_path
+
+
+def parser_run(folder: Path, out: str, **changes) -> ParserTraining:
+    settings = dict(preset=PUBLISHED.name, steps=3, batch=5, clip=2, warmup=1) | changes
+    return ParserTraining(folder / "train.h5", folder / "val.h5", folder / out, **settings)
+
+
+def predictor_run(folder: Path, out: str, **changes) -> PredictorTraining:
+    settings = dict(parser=folder / PLACED.name, steps=3, batch=5, warmup=1, horizon=2, image_weight=1.0)
+    return PredictorTraining(folder / "train.h5", folder / "val.h5", folder / out, **(settings | changes))
+
+
+def train(args: ParserTraining | PredictorTraining) -> None:
+    (train_parser if isinstance(args, ParserTraining) else train_predictor).train(args)  # type: ignore[arg-type]
+
+
+def weights(out: Path) -> dict[str, torch.Tensor]:
+    return TextOCVP.from_pretrained(out / "checkpoint").state_dict()
+
+
+def losses(out: Path) -> list[float]:
+    """What every step's loss was, as the log has it."""
+    log = EventAccumulator(str(out / "logs" / "training"))
+    log.Reload()
+    return [scalar.value for scalar in log.Scalars("loss/total")]
+
+
+def assert_same_run(one: Path, other: Path, *, exactly: bool = False) -> None:
+    a, b = weights(one), weights(other)
+    assert a.keys() == b.keys()
+    for name in a:
+        torch.testing.assert_close(a[name], b[name], atol=0 if exactly else 1e-6, rtol=0, msg=name)
+    np.testing.assert_allclose(losses(one), losses(other), rtol=0 if exactly else 1e-6)
+
+
+def test_two_processes_are_the_same_run_as_one(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command that people use, started twice by torchrun, meeting over gloo."""
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    command = [*launcher, "-m", "tests.textocvp.both_stages", str(folder), "two"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as started:
+        monkeypatch.setattr(training, "LOG_EVERY", 1)
+        both_stages.main(folder, "one")
+        printed, _ = started.communicate(timeout=300)
+    assert started.returncode == 0, printed[-3000:]
+    for run in both_stages.RUNS:
+        one, two = folder / "one" / run, folder / "two" / run
+        assert (two / "state" / "random_states_1.pkl").exists(), "there was no second process"
+        assert len(losses(two)) == both_stages.STEPS
+        assert_same_run(one, two)
+
+
+@pytest.mark.parametrize("make", [parser_run, predictor_run])
+def test_parts_of_a_batch_add_up_to_it(folder: Path, monkeypatch: pytest.MonkeyPatch, make) -> None:
+    monkeypatch.setattr(training, "LOG_EVERY", 1)
+    whole, parts = make(folder, "whole"), make(folder, "parts", accumulate=3)  # of 1, 2 and 2 rows
+    train(whole)
+    train(parts)
+    assert_same_run(whole.out, parts.out)
+
+
+def test_workers_change_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "LOG_EVERY", 1)
+    alone, helped = parser_run(folder, "alone"), parser_run(folder, "helped", workers=2)
+    train(alone)
+    train(helped)
+    assert_same_run(alone.out, helped.out, exactly=True)
+
+
+def test_workers_read_the_steps_in_their_order(folder: Path) -> None:
+    args = parser_run(folder, "out", stride=3)
+    with EpisodeFile(args.data) as episodes:
+        reader = ClipReader(episodes, args, slice(0, args.batch))
+        expected = [reader(step) for step in range(4, 11)]
+        for workers in (1, 3):
+            read = list(read_ahead(reader, range(4, 11), workers))
+            assert len(read) == len(expected)
+            for a, b in zip(read, expected, strict=True):
+                assert torch.equal(a.frames_BTHW3, b.frames_BTHW3) and torch.equal(a.seeds_B, b.seeds_B)
+    assert not torch.equal(expected[0].frames_BTHW3, expected[1].frames_BTHW3)
+
+
+def test_shares_of_the_clips_are_the_clips(folder: Path) -> None:
+    args = parser_run(folder, "out")
+    with EpisodeFile(args.data) as episodes:
+        whole = ClipReader(episodes, args, slice(0, 5))(7)
+        shares = [ClipReader(episodes, args, rows)(7) for rows in (slice(0, 2), slice(2, 5))]
+    assert whole.frames_BTHW3.shape == (5, 2, 32, 32, 3) and len(set(whole.seeds_B.tolist())) == 5
+    assert torch.equal(torch.cat([share.frames_BTHW3 for share in shares]), whole.frames_BTHW3)
+    assert torch.equal(torch.cat([share.seeds_B for share in shares]), whole.seeds_B)
+
+
+@pytest.mark.parametrize("make", [parser_run, predictor_run])
+def test_a_terminated_run_saves_itself_and_continues_exactly(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, make
+) -> None:
+    """SIGTERM is what a cluster sends before it takes a machine away."""
+    monkeypatch.setattr(training, "LOG_EVERY", 1)
+    straight, resumed = (make(folder, name, accumulate=2, steps=4) for name in ("straight", "resumed"))
+    train(straight)
+
+    update = Run.update
+
+    def asked_to_end(self, step, figures=None):
+        update(self, step, figures)
+        if step == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(Run, "update", asked_to_end)
+    with pytest.raises(SystemExit) as stop:
+        train(resumed)
+    assert stop.value.code == 143 and signal.getsignal(signal.SIGTERM) is before
+    assert not (resumed.out / "checkpoint").exists()
+    monkeypatch.setattr(Run, "update", update)
+    steps = []
+    monkeypatch.setattr(Run, "update", lambda *args: steps.append(args[1]) or update(*args))
+    torch.rand(7)  # the world goes on
+    train(resumed)
+    assert steps == [2, 3]
+    a, b = weights(straight.out), weights(resumed.out)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_brain_floats_are_close_to_floats(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "LOG_EVERY", 1)
+    for make in (parser_run, predictor_run):
+        plain, mixed = make(folder, make.__name__), make(folder, make.__name__ + "-bf16", precision="bf16")
+        train(plain)
+        train(mixed)
+        assert losses(plain.out) != losses(mixed.out)
+        np.testing.assert_allclose(losses(plain.out), losses(mixed.out), rtol=0.03)
+
+
+def test_what_cannot_be_done_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    with pytest.raises(SettingsError, match=r"batch of 5 .* 1 processes x 6 parts"):
+        train(parser_run(folder, "out", accumulate=6))
+    with pytest.raises(SettingsError, match="accumulate must be at least 1"):
+        train(replace(parser_run(folder, "out"), accumulate=0))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    files = ["--data", str(folder / "train.h5"), "--val", str(folder / "val.h5")]
+    arguments = ["train", "parser", *files, "--out", str(folder / "half"), "--precision", "fp16"]
+    assert cli.main(arguments) == 1
+    assert "fp16 needs a GPU" in capsys.readouterr().err and not (folder / "half").exists()
