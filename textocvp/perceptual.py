@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -112,8 +113,10 @@ def load_lpips() -> PerceptualDistance:
             f"LPIPS needs the package lpips and a torchvision that fits the installed torch: {error}"
         ) from error
     try:
-        # The library prints to stdout while it loads, which would end up in a study's table.
-        with contextlib.redirect_stdout(io.StringIO()):
+        # The library prints to stdout while it loads, and calls torchvision in a way that has gone out of fashion;
+        # both would end up in a study's table.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
             network: Any = lpips.LPIPS(net="alex", verbose=False).eval()
     except (OSError, RuntimeError) as error:
         raise MetricUnavailable(f"LPIPS could not load the weights of AlexNet: {error}") from error

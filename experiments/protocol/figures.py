@@ -24,15 +24,18 @@ def rate_row(method: str, split: str, variant: str, metric: str, success_NR: Any
     rates_N = success.reshape(len(success), -1).mean(axis=1)
     # The sum is fractional where repeats of a scene disagree; the formula does not mind.
     interval = wilson_interval(float(rates_N.sum()), len(rates_N))  # type: ignore[arg-type]
-    return _row(method, split, variant, metric, interval)
+    return interval_row(method, split, variant, metric, interval)
 
 
 def mean_row(method: str, split: str, variant: str, metric: str, values_N: Any) -> Row:
     """A mean over N scenes with its bootstrap interval."""
-    return _row(method, split, variant, metric, bootstrap_interval(np.asarray(values_N, dtype=np.float64)))
+    return interval_row(
+        method, split, variant, metric, bootstrap_interval(np.asarray(values_N, dtype=np.float64))
+    )
 
 
-def _row(method: str, split: str, variant: str, metric: str, interval: Interval) -> Row:
+def interval_row(method: str, split: str, variant: str, metric: str, interval: Interval) -> Row:
+    """A figure whose interval is known."""
     # Rounding of equal values may leave a mean outside its interval by one bit.
     low, high = min(interval.low, interval.value), max(interval.high, interval.value)
     return Row(method, split, variant, metric, interval.value, low, high, interval.n)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -18,6 +18,7 @@ from textocvp import WorldModel
 from textocvp.world_model import Checkpoint
 
 Out = TypeVar("Out", covariant=True)
+Model = TypeVar("Model")
 
 
 class StudyModel(Imagines, Protocol):
@@ -60,13 +61,14 @@ class Worker:
 
     world_model: StudyModel
     _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
-    _others: dict[LoadWorldModel, StudyModel] = field(default_factory=dict)
+    _others: dict[Callable[[], Any], Any] = field(default_factory=dict)
 
-    def other(self, load: LoadWorldModel) -> StudyModel:
-        """Another world model, as a baseline, made once a process."""
+    def other(self, load: Callable[[], Model]) -> Model:
+        """Another model, as a baseline, made once a process. `load` must be hashable."""
         if load not in self._others:
             self._others[load] = load()
-        return self._others[load]
+        model: Model = self._others[load]
+        return model
 
     def environment(self, scene: TestScene) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""

@@ -26,8 +26,14 @@ class Theme:
 
 
 # The series colours keep at least 3:1 against their page and differ in lightness, not only in hue.
-LIGHT = Theme("#ffffff", "#24303b", "#dfe4e8", ("#1f6f8b", "#d07a2d", "#7a8894", "#8a5a9e", "#4f8a4c"))
-DARK = Theme("#161b20", "#d7dee4", "#303942", ("#62b6d4", "#eda464", "#94a1ac", "#c39ad6", "#8cc788"))
+LIGHT = Theme(
+    "#ffffff", "#24303b", "#dfe4e8",
+    ("#1f6f8b", "#d07a2d", "#7a8894", "#8a5a9e", "#4f8a4c", "#b4472f", "#a08400", "#2f4a9e"),
+)  # fmt: skip
+DARK = Theme(
+    "#161b20", "#d7dee4", "#303942",
+    ("#62b6d4", "#eda464", "#94a1ac", "#c39ad6", "#8cc788", "#ec8f78", "#dcc04a", "#8fa6f0"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -150,12 +156,16 @@ def curve_plot(
     across: str,
     caption: str = "",
     marks: Sequence[tuple[float, str]] = (),
+    colors: Sequence[int] | None = None,
 ) -> Figure:
-    """Curves over frames with bands: (label, (T, 3) value, low, high) each; `marks` are labelled levels."""
+    """Curves over frames with bands: (label, (T, 3) value, low, high) each; `marks` are labelled levels.
+
+    `colors` are indices into the theme's colours; without them, each curve's place among the curves.
+    """
 
     def draw(axes: Axes, theme: Theme) -> None:
         for i, (title, curve) in enumerate(curves):
-            color = theme.series[i % len(theme.series)]
+            color = theme.series[(i if colors is None else colors[i]) % len(theme.series)]
             frames = np.arange(1, len(curve) + 1)
             axes.fill_between(frames, curve[:, 1], curve[:, 2], color=color, alpha=0.18, linewidth=0)
             axes.plot(frames, curve[:, 0], color=color, linewidth=2, label=title)
@@ -166,7 +176,13 @@ def curve_plot(
         axes.set_xlabel(across)
         axes.set_ylabel(label)
         axes.grid(color=theme.faint, linewidth=0.8)
-        axes.legend(frameon=False, labelcolor=theme.ink, fontsize=9)
+        if len(curves) <= 3:
+            axes.legend(frameon=False, labelcolor=theme.ink, fontsize=9)
+        else:  # there is no room for it among so many curves
+            axes.legend(
+                loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, labelcolor=theme.ink,
+                fontsize=9, handlelength=1.2, columnspacing=1.2,
+            )  # fmt: skip
 
     return _figure(
         name, draw, (5.8, 3.4), f"{label} over {across}: " + ", ".join(t for t, _ in curves), caption

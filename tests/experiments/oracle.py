@@ -61,7 +61,7 @@ class StudyOracle:
         self._stubborn = stubborn
 
     def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
-        """One frame: the scene as it is now. Several: every frame since the last reset."""
+        """One frame: the scene as it is now. Several: as many frames since the last reset, whatever they show."""
         oracle, now = self._oracle(), None
         parsed = oracle.parse(video[-1:], seed=seed)
         if len(video) == 1:
@@ -69,7 +69,7 @@ class StudyOracle:
         states = [info["frame_states"] for info in _history]
         position_TN3 = np.concatenate([state["object_position"] for state in states])
         tip_T3 = np.concatenate([state["gripper"][:, :3] for state in states])
-        assert len(position_TN3) == len(video)
+        assert len(position_TN3) >= len(video)
         slots = []
         for t in range(len(video)):
             now = [{**item, "position": position_TN3[t, i]} for i, item in enumerate(_history[-1]["objects"])]

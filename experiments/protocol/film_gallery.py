@@ -1,0 +1,74 @@
+"""Clips of imagined films beside the real one: pictures above masks, one colour a thing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from experiments.protocol.contenders import Contender
+from experiments.protocol.films import as_pictures, film, slots_of
+from experiments.protocol.scenes import TestScene
+from experiments.protocol.workers import Worker
+from experiments.reporting import Clip
+from experiments.reporting.clips import gif, paint, segmentation_colors, slot_colors
+
+#: An episode of the tabletop.
+LENGTH = 24
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class FilmPicture:
+    """A unit of work: draw one scene, imagined by ours and the baselines.
+
+    Attributes:
+        scene: which. contenders: the baselines. seed: of the slots.
+        group: first part of the file's name.
+        rank, best: its place among the best or the worst.
+        caption: what it was ranked by.
+        good: whether that is good in itself; None where only the rank is known.
+    """
+
+    scene: TestScene
+    contenders: tuple[Contender, ...]
+    seed: int
+    group: str
+    rank: int
+    best: bool
+    caption: str
+    good: bool | None = None
+
+    def run(self, worker: Worker) -> Clip:
+        """Imagine and play it once more."""
+        happened, films = film(
+            worker, self.scene, self.contenders, horizon=LENGTH, seed=self.seed, controls=False
+        )
+        info = happened.drawn.info
+        objects = len(info["objects"])
+        masks = [paint(happened.segmentations, segmentation_colors(objects))]
+        for one in films:
+            rollout = slots_of(worker, one, self.seed)
+            labels_THW = rollout.masks[0].argmax(1).cpu().numpy()
+            colors = slot_colors(labels_THW[0], info["segmentation"], rollout.slots.shape[2], objects)
+            masks.append(paint(labels_THW, colors))
+        kind = "best" if self.best else "worst"
+        tone = "plain" if self.good is None else "good" if self.good else "bad"
+        return Clip(
+            name=f"{self.group}-{kind}-{self.rank}.gif",
+            gif=gif([[happened.frames, *(as_pictures(one.frames) for one in films)], masks]),
+            panels=("real", *(one.method for one in films)),
+            title=happened.text,
+            caption=f"{self.caption}; seed {self.scene.seed}",
+            badge=f"{kind} {self.rank}",
+            tone=tone,  # type: ignore[arg-type]
+        )
+
+
+def extremes(cases: Sequence[T], badness: Sequence[float], count: int) -> tuple[list[T], list[T]]:
+    """The `count` best cases and the `count` worst ones, most extreme first; no case is both."""
+    order = [int(i) for i in np.argsort(np.asarray(badness), kind="stable")]
+    count = min(count, len(cases) // 2)
+    return [cases[i] for i in order[:count]], [cases[i] for i in reversed(order[len(order) - count :])]
