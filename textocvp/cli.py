@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.config import PRESETS, preset
+from textocvp.config import PRESETS, preset, with_settings
 from textocvp.drawing import SUFFIXES
 from textocvp.model import CONFIG_FILE, CheckpointError, TextOCVP
 from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel, bundled_checkpoints
@@ -121,14 +121,16 @@ def _train(arguments: list[str]) -> None:
     # never use.
     from textocvp import train_parser, train_predictor
     from textocvp.episodes import EpisodeFile
-    from textocvp.mage import train_vqvae
+    from textocvp.mage import train_mage, train_vqvae
     from textocvp.mage.config import mage_preset
     from textocvp.slot_cache import SlotCacheError
+    from textocvp.training import SettingsError
 
     Stage = Union[  # noqa: UP007
         Annotated[train_parser.ParserTraining, tyro.conf.subcommand("parser")],
         Annotated[train_predictor.PredictorTraining, tyro.conf.subcommand("predictor")],
         Annotated[train_vqvae.VQVAETraining, tyro.conf.subcommand("vqvae")],
+        Annotated[train_mage.MageTraining, tyro.conf.subcommand("mage")],
     ]
     chosen: Any = tyro.cli(
         Stage,
@@ -141,22 +143,24 @@ def _train(arguments: list[str]) -> None:
     # What can be known to be wrong is said at once, before anything is built or written.
     try:
         if chosen.preset is not None:
-            (mage_preset if isinstance(chosen, train_vqvae.VQVAETraining) else preset)(chosen.preset)
+            of_mage = isinstance(chosen, (train_vqvae.VQVAETraining, train_mage.MageTraining))
+            with_settings((mage_preset if of_mage else preset)(chosen.preset), chosen.set)
         for path in (chosen.data, chosen.val):
             EpisodeFile(path).close()
     except KeyError as error:
         raise Mistake(error.args[0]) from error
     except (OSError, ValueError) as error:
         raise Mistake(str(error)) from error
-    if isinstance(chosen, train_parser.ParserTraining):
-        train_parser.train(chosen)
-    elif isinstance(chosen, train_vqvae.VQVAETraining):
-        train_vqvae.train(chosen)
-    else:
-        try:
-            train_predictor.train(chosen)
-        except SlotCacheError as error:
-            raise Mistake(str(error)) from error
+    train: dict[type, Callable[[Any], object]] = {
+        train_parser.ParserTraining: train_parser.train,
+        train_predictor.PredictorTraining: train_predictor.train,
+        train_vqvae.VQVAETraining: train_vqvae.train,
+        train_mage.MageTraining: train_mage.train,
+    }
+    try:
+        train[type(chosen)](chosen)
+    except (SettingsError, SlotCacheError) as error:
+        raise Mistake(str(error)) from error
 
 
 def _rollout(command: RolloutCommand) -> None:

@@ -226,15 +226,15 @@ def with_settings(config: C, settings: Iterable[str]) -> C:
 
 
 def _changed(node: Any, names: list[str], text: str, path: str) -> Any:
-    known, groups = [f.name for f in fields(node)], _groups(type(node))
+    known = [f.name for f in fields(node)]
     if names[0] not in known:
         raise ValueError(f"unknown setting {path!r}: no field {names[0]!r}; known: {', '.join(known)}")
     value = getattr(node, names[0])
     if len(names) > 1:
-        if names[0] not in groups:
+        if not is_dataclass(value):
             raise ValueError(f"unknown setting {path!r}: {names[0]!r} has no fields")
         return replace(node, **{names[0]: _changed(value, names[1:], text, path)})
-    if names[0] in groups:
+    if is_dataclass(value):
         raise ValueError(f"{path!r} is a group; set one of {', '.join(f.name for f in fields(value))}")
     try:
         chosen = json.loads(text)
