@@ -199,7 +199,7 @@ def headline(rows: Sequence[Row]) -> dict[str, float]:
 
 def seeds_used(episodes: dict[str, list[LongEpisode]], seed: int) -> dict[str, list[int]]:
     """Every seed, by what it was used for."""
-    seeds = {"slots and random choices": [seed]}
+    seeds = {"slots": [seed]}
     for name, units in episodes.items():
         if units:
             seeds[f"scenes, {name}"] = list(dict.fromkeys(unit.scene.seed for unit in units))

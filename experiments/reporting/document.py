@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from experiments.reporting.results import Results
 from experiments.reporting.table import DASH, Table
@@ -111,14 +111,14 @@ class Report:
     cards: Sequence[Card]
     sections: Sequence[Section]
     command: str
-    again: str = (
-        "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
-    )
+    again: str = "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
 
     def to_html(self) -> str:
         """The page, with every image inside it."""
-        return _template().render(
-            report=self, results=self.results, uri=_data_uri, kind=_kind, seeds=_seed_text
+        return (
+            environment()
+            .get_template("report.html.j2")
+            .render(report=self, results=self.results, uri=_data_uri, kind=_kind, seeds=_seed_text)
         )
 
     def write(self, folder: Path) -> None:
@@ -160,12 +160,12 @@ def _seed_text(seeds: Sequence[int]) -> str:
 
 
 @cache
-def _template() -> Template:
-    environment = Environment(
+def environment() -> Environment:
+    """Where the templates of the pages are found; everything that is put into them is escaped."""
+    return Environment(
         loader=PackageLoader("experiments.reporting", "templates"),
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("report.html.j2")
