@@ -1,0 +1,230 @@
+"""The interpretability study: exact figures for attention that is known, and for models broken in a known way."""
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from experiments.interpretability import Args, Sizes, main
+from experiments.protocol.arguments import UsageError
+from experiments.protocol.listening import GROUPS, attends_most, hear
+from experiments.protocol.listening_gallery import choose_listening, glow
+from experiments.protocol.listening_rows import headline, listening_rows
+from experiments.protocol.listening_scenes import ListeningOutcome, ListeningScene, without_color_match
+from experiments.protocol.scenes import test_scenes
+from experiments.protocol.words import TEMPLATE, merge_words
+from experiments.protocol.workers import Worker
+from planning import Grounding, Instruction
+from tests.experiments.listener import HEADS, LAYERS, Listener, LoadListener
+from tests.experiments.oracle import LoadOracle
+from textocvp import WorldModel
+from textocvp.config import PRESETS
+from textocvp.model import TextOCVP
+from textocvp.rollout import Rollout
+
+TEXT = "put the red block in the blue bowl"
+PRESENT = np.array([True, True, True, False])
+
+
+# ---------------------------------------------------------------- words
+
+
+@pytest.mark.parametrize(
+    "tokens",
+    [
+        TEXT.split(),
+        ["[CLS]", *TEXT.split(), "[SEP]"],
+        ["\u2581put", "\u2581the", "\u2581", "r", "ed", "\u2581block", "\u2581in", "\u2581the", "\u2581blu", "e",
+         "\u2581bowl", "</s>"],
+        ["put", "the", "re", "##d", "block", "in", "the", "blue", "bo", "##wl"],
+    ],
+)  # fmt: skip
+def test_tokens_are_summed_to_words(tokens: list[str]) -> None:
+    values = np.full((2, len(tokens) + 3), 0.1)
+    merged = merge_words(values, tokens, TEXT)
+    assert merged.shape == (2, len(TEMPLATE))
+    plain = [t for t in tokens if t[0] not in "<[" and t != "\u2581"]
+    assert merged.sum() == pytest.approx(0.2 * len(plain))
+    assert (merged >= 0.1 - 1e-9).all()
+
+
+def test_a_colour_of_two_tokens_counts_whole() -> None:
+    tokens = ["put", "the", "re", "##d", "block", "in", "the", "blue", "bowl"]
+    merged = merge_words(np.arange(9.0), tokens, TEXT)
+    assert merged.tolist() == [0, 1, 5, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("tokens", [TEXT.split()[:-1], [*TEXT.split(), "now"], ["put", "a", "red"], []])
+def test_tokens_of_another_text_are_refused(tokens: list[str]) -> None:
+    with pytest.raises(UsageError, match="do not spell"):
+        merge_words(np.ones(12), tokens, TEXT)
+
+
+# ---------------------------------------------------------------- who attends most
+
+
+def test_most_is_more_than_every_other_present_slot() -> None:
+    shares = np.array([[0.2, 0.5, 0.1, 0.9], [0.5, 0.5, 0.1, 0.0], [0.6, 0.5, 0.1, 0.0]])
+    # The absent slot is not asked; a tie is no lead.
+    assert attends_most(shares, [1], PRESENT).tolist() == [True, False, False]
+    assert attends_most(shares, [0], PRESENT).tolist() == [False, False, True]
+    assert attends_most(shares, [0, 2], PRESENT).tolist() == [False, False, True]
+    assert not attends_most(shares, [], PRESENT).any() and not attends_most(shares, [3], PRESENT).any()
+
+
+@lru_cache
+def outcome(kind: str, split: str = "controllability", variants: int = 3) -> ListeningOutcome:
+    (scene,) = test_scenes(split, 1, 0)
+    return ListeningScene(scene, variants, 0).run(Worker(LoadListener(kind)()))  # type: ignore[arg-type]
+
+
+def test_who_listens_gets_full_marks_everywhere() -> None:
+    heard = outcome("listens").heard
+    assert len(heard) == 4
+    for one in heard:
+        assert one.most_R.all() and one.most_Rnh.shape == (2, LAYERS, HEADS) and one.most_Rnh.all()
+        assert one.most_RT.shape == (2, 24) and one.most_RT.all() and one.ends_in_bowl
+        np.testing.assert_allclose(one.margin_R, 0.9 - 1 / 9, atol=1e-6)
+        # 8 slots are present: table, arm and 6 objects, without the two spare ones.
+        np.testing.assert_allclose(one.chance_R, 1 / 8)
+        np.testing.assert_allclose(one.shares_RTG[0, :, GROUPS.index("named block")], 0.9, atol=1e-6)
+        np.testing.assert_allclose(one.map_nhGW[0, 0, GROUPS.index("arm")], 1 / 9, atol=1e-6)
+    assert outcome("listens").by_looks_VR.all()
+    # Under the wrong sentence other things listen.
+    assert not np.nansum(outcome("listens").wrong_R) and not outcome("listens").wrong_ends
+
+
+def test_the_deaf_and_the_confused_get_nothing() -> None:
+    for kind in ("deaf", "swapped"):
+        for one in outcome(kind).heard:
+            assert not one.most_R.any() and not one.most_Rnh.any() and not one.most_RT.any()
+        assert not outcome(kind).by_looks_VR.any()
+    np.testing.assert_allclose(outcome("deaf").heard[0].margin_R, 0, atol=1e-6)
+    np.testing.assert_allclose(outcome("swapped").heard[0].margin_R, 0.1 / 8 - 0.9, atol=1e-6)
+
+
+def test_heads_and_steps_are_told_apart() -> None:
+    head = outcome("one head").heard[0]
+    assert head.most_R.all() and head.most_Rnh[:, 1, 2].all() and head.most_Rnh.sum() == 2
+    late = outcome("late").heard[0]
+    assert late.most_R.all() and not late.most_RT[:, :12].any() and late.most_RT[:, 12:].all()
+
+
+def test_rows_and_headline() -> None:
+    rows = listening_rows([outcome("listens"), outcome("listens", "unseen_colors", 0)])
+    found = {(r.method, r.split, r.variant, r.metric): r for r in rows}
+    assert found["ours", "controllability", "variants mean", "attends_bowl"].value == 1
+    assert (
+        found["ours", "controllability", "variants mean", "attends_bowl"].n == 1
+    )  # three texts of one scene
+    assert found["wrong sentence", "controllability", "original", "attends_bowl"].value == 0
+    assert found["chance", "controllability", "original", "attends_block"].value == pytest.approx(1 / 8)
+    assert ("wrong sentence", "controllability", "variants mean", "attends_bowl") not in found
+    head = headline(rows)
+    assert head["attends_block_controllability"] == head["attends_bowl_unseen_colors"] == 1
+    assert head["attends_bowl_wrong_sentence"] == 0 and head["ends_in_bowl_controllability"] == 1
+
+
+def test_the_best_and_the_worst_are_those_with_the_largest_and_smallest_lead() -> None:
+    chosen = choose_listening([outcome("swapped"), outcome("late", "unseen_colors", 0)], 3, 0, 1)
+    assert [(p.best, p.scene.split, p.success) for p in chosen] == [
+        (True, "unseen_colors", True),
+        (False, "controllability", False),
+    ]
+    assert [(p.variants, p.variant) for p in chosen] == [(0, 0), (3, 0)]
+
+
+def test_a_slot_glows_with_its_share() -> None:
+    masks = np.zeros((3, 2, 1, 2))
+    masks[:, 0, 0, 0] = masks[:, 1, 0, 1] = 1
+    film = glow(np.zeros((3, 1, 2, 3), np.uint8), masks, np.array([[0.4, 0.1], [0.0, 0.2]]))
+    assert film[0].tolist() == film[1].tolist()  # nothing was imagined before the first step
+    assert film[1, 0, 0].tolist() == [255, 138, 30]  # the brightest share of the film
+    assert film[2, 0, 0].tolist() == [24, 24, 24]
+    assert 24 < film[1, 0, 1, 0] < film[2, 0, 1, 0] < 255
+
+
+# ---------------------------------------------------------------- the colour term
+
+
+def test_the_colour_term_is_switched_off_in_a_copy_only() -> None:
+    world_model = WorldModel.from_pretrained()
+    silent = without_color_match(world_model)
+    assert silent is not None
+    gains = [layer.color_gain_h for layer in world_model.model.predictor.layers]
+    assert all(gain.abs().min() > 1 for gain in gains)
+    assert all(not layer.color_gain_h.any() for layer in silent.model.predictor.layers)
+    named = dict(silent.model.named_parameters())
+    for name, parameter in world_model.model.named_parameters():
+        assert torch.equal(named[name], parameter) or name.endswith("color_gain_h")
+    assert without_color_match(LoadOracle()()) is None
+
+
+def test_the_term_changes_what_the_shipped_model_hears() -> None:
+    (scene,) = test_scenes("controllability", 1, 0)
+    measured = ListeningScene(scene, 1, 0).run(Worker(WorldModel.from_pretrained()))
+    assert measured.colors_VR is not None and measured.colors_VR.shape == (2, 2)
+    assert len(measured.silent) == 2
+    assert not np.allclose(measured.silent[0].map_nhGW, measured.heard[0].map_nhGW, equal_nan=True)
+    for one in (*measured.heard, *measured.silent):  # every row of a map is a whole attention
+        np.testing.assert_allclose(one.map_nhGW[:, :, 0].sum(-1), 1, atol=1e-4)
+
+
+# ---------------------------------------------------------------- the study
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "results"
+    main(Args(out=out, quick=True, workers=1), LoadListener("listens"), Sizes(scenes=1, clips=1))
+    return out
+
+
+def test_the_folder_is_complete(folder: Path) -> None:
+    data = json.loads((folder / "results.json").read_text())
+    assert data["study"] == "interpretability" and data["quick"] is True
+    assert (
+        data["headline"]["attends_block_test"] == 1 and "attends_bowl_colour_term_off" not in data["headline"]
+    )
+    assert set(data["seeds"]) == {"slots", "scenes, test", "scenes, controllability", "scenes, unseen_colors"}
+    assert any(row["method"] == "ours, layer 2 head 3" for row in data["rows"])
+    names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}
+    wanted = {"attention.png", "attention_heads.png", "heads_block.png", "shares_bowl.png", "words-worst.png"}
+    assert {f"plots/{name}" for name in wanted} <= names
+    assert {"clips/listening-best-1.gif", "clips/listening-worst-1.gif"} <= names
+    page = (folder / "report.html").read_text()
+    assert "Quick run" in page and "should be near 0" in page
+    assert "colour-matching term decide" not in page  # the double has none
+
+
+class Mute(Listener):
+    """Keeps no attention."""
+
+    def rollout(self, *args: Any, attention: bool = False, **kwargs: Any) -> Rollout:
+        return super().rollout(*args, **kwargs)
+
+
+def test_a_model_without_attention_is_refused(tmp_path: Path) -> None:
+    LoadListener("listens")()
+    (scene,) = test_scenes("test", 1, 0)
+    with pytest.raises(UsageError, match="oracle keeps no attention"):
+        ListeningScene(scene, 0, 0).run(Worker(Mute("listens")))
+    deaf = WorldModel(TextOCVP(PRESETS["ocvp-seq-small"]))
+    with pytest.raises(UsageError, match="hears no text"):
+        main(Args(out=tmp_path / "r", checkpoint="mine", workers=1), lambda: deaf)  # type: ignore[arg-type]
+    assert list((tmp_path / "r").iterdir()) == []
+
+
+def test_a_thing_without_slot_is_a_miss() -> None:
+    attention = np.zeros((2, 1, 1, 4, 8))
+    attention[..., 1, 2] = 1.0
+    told = Instruction.parse(TEXT)
+    heard = hear(attention, PRESENT, Grounding((0,), (2,), {told.block_thing: (1,)}), told, False)
+    assert heard.most_R.tolist() == [True, False]
+    assert heard.margin_R[0] == 1 and np.isnan(heard.margin_R[1])
+    assert heard.chance_R.tolist() == [pytest.approx(1 / 3), 0]
+    assert np.isnan(heard.map_nhGW[0, 0, GROUPS.index("named bowl")]).all()
