@@ -142,6 +142,13 @@ def imagine_and_judge(
     return rollout, ours, wrong
 
 
+def judge_rollout(rollout: Rollout, camera: PinholeCamera, text: str) -> bool:
+    """Whether a rollout or a parsed film of a whole episode (B = 1) shows what the sentence says."""
+    instruction = Instruction.parse(text)
+    success_B, _ = _judge(_trace(rollout, _ground(rollout, camera, [instruction]), [instruction]))
+    return bool(success_B[0])
+
+
 def _ground(rollout: Rollout, camera: PinholeCamera, instructions: list[Instruction]) -> Grounding | None:
     """By appearance, on the first frame, which all rollouts of a batch share."""
     try:

@@ -1,0 +1,160 @@
+"""The robustness study: drops by hand, and the study as a whole with doubles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.protocol.frame_scores import FrameScores, Measures
+from experiments.protocol.robustness import (
+    REREAD,
+    SPLITS,
+    Column,
+    RobustOutcome,
+    RobustScene,
+    imagined_columns,
+)
+from experiments.protocol.robustness_report import BARS, percent, verdict
+from experiments.protocol.scenes import test_scenes
+from experiments.protocol.workers import Worker
+from experiments.reporting import Checkpoint, Results
+from experiments.robustness import Args, Sizes, choose_films, headline, main
+from tests.experiments.oracle import LoadOracle
+from tests.experiments.test_films import STILL, LoadStill
+
+ST_LPIPS = Measures(("st_lpips",), None, (), (("lpips", "no weights here"),))
+BARE = Measures((), None, (), ())
+
+
+def column(metric: str, test: list[float], unseen: list[float]) -> Column:
+    return Column("ours", "9 frames", metric, {"test": np.array(test), "unseen_colors": np.array(unseen)})
+
+
+def test_a_drop_is_how_much_worse_a_figure_is() -> None:
+    """.75 is a quarter less than 1; a distance of .06 is a fifth more than .05. Both are drops."""
+    success = column("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0])
+    assert success.drop("unseen_colors").value == pytest.approx(0.25)  # type: ignore[union-attr]
+    distance = column("st_lpips", [0.05, 0.05], [0.05, 0.07])
+    found = distance.drop("unseen_colors")
+    assert found is not None and found.value == pytest.approx(0.2)
+    assert (found.low, found.high) == pytest.approx((0.0, 0.4)) and found.n == 2
+    better = column("ssim", [0.8, 0.8], [0.88, 0.88]).drop("unseen_colors")
+    assert better is not None and (better.low, better.value, better.high) == pytest.approx((-0.1,) * 3)
+    assert column("iou", [0.0, 0.0], [0.5]).drop("unseen_colors") is None  # nothing to fall from
+    assert success.drop("more_objects") is None
+
+
+def test_rows_of_a_figure() -> None:
+    rows = column("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0]).rows()
+    assert [(r.split, r.metric, r.n) for r in rows] == [
+        ("test", "closed_loop_success", 4),
+        ("unseen_colors", "closed_loop_success", 4),
+        ("unseen_colors", "closed_loop_success_drop", 4),
+    ]
+    assert rows[1].value == 0.75 and rows[1].high < 1  # Wilson
+
+
+def outcome(split: str, number: int, ssim: float, good: bool) -> RobustOutcome:
+    scene = test_scenes(split, number + 1, 0)[number]
+    scores = FrameScores("ours", {"ssim": np.full(24, ssim)}, {})
+    return RobustOutcome(scene, "", (scores,), {"ours": np.full(24, 0.5)}, {"ours": good})
+
+
+def test_worst_cases_are_failures_first_and_never_of_the_test_set() -> None:
+    outcomes = [
+        outcome("test", 0, 0.1, False),
+        outcome("unseen_colors", 0, 0.9, True),
+        outcome("unseen_colors", 1, 0.2, True),
+        outcome("more_objects", 0, 0.8, False),
+        outcome("more_objects", 1, 0.7, True),
+    ]
+    shown = [(p.best, p.scene.split, p.good) for p in choose_films(outcomes, (), BARE, 0, 2)]
+    assert shown == [
+        (True, "unseen_colors", True),
+        (True, "more_objects", True),
+        (False, "more_objects", False),
+        (False, "unseen_colors", True),
+    ]
+    found = {(c.metric, c.variant): c.values for c in imagined_columns(outcomes, ("ssim",))}
+    assert found["predicted_success", "whole episode"]["more_objects"].tolist() == [0.0, 1.0]
+    assert found["ssim", "19 frames"]["unseen_colors"] == pytest.approx([0.9, 0.2])
+
+
+def results(**figures: float) -> Results:
+    return Results("robustness", Checkpoint("a", ""), {}, {}, False, 1.0, [], figures)
+
+
+def test_bars_are_passed_missed_or_undecided() -> None:
+    unseen, more, drop, _ = BARS
+    assert verdict(unseen, results(closed_loop_unseen_colors=0.75)) == "pass"
+    assert verdict(unseen, results(closed_loop_unseen_colors=0.74)) == "miss"
+    assert verdict(more, results(closed_loop_more_objects=0.79)) == "miss"
+    assert verdict(more, results()) == "not measured"
+    assert verdict(drop, results(lpips_drop_unseen_colors=0.1, lpips_drop_unseen_colors_mage=0.2)) == "pass"
+    assert verdict(drop, results(lpips_drop_unseen_colors=0.2, lpips_drop_unseen_colors_mage=0.2)) == "miss"
+    assert verdict(drop, results(lpips_drop_unseen_colors=0.2)) == "undecided: no MAGE"
+    assert verdict(drop, results()) == "undecided: no LPIPS"
+    assert percent(-0.064) == "-6.4 %"
+
+
+def test_without_a_learned_distance_its_headline_is_absent() -> None:
+    rows = Column("ours", "9 frames", "ssim", {"test": np.ones(2), "unseen_colors": np.ones(2)}).rows()
+    assert headline(rows, BARE) == {}
+
+
+def test_a_model_that_is_always_right_is_judged_right_with_and_without_its_own_masks() -> None:
+    (scene,) = test_scenes("more_objects", 1, 0)
+    outcome = RobustScene(scene, (STILL,), BARE, 0).run(Worker(LoadOracle()()))
+    assert outcome.success == {
+        "ours": True, REREAD: True, "true frames": True, "wrong text": False, "copy frame": True,
+    }  # fmt: skip
+    # The double's parser knows what happened whatever it is shown, so REREAD and `copy frame` are right here too.
+    assert outcome.mean("ours", "iou", 19) is not None and outcome.mean("MAGE", "iou", 19) is None
+    assert len(outcome.ious["MAGE"]) == 12 and "MAGE" not in outcome.success
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "results"
+    main(
+        Args(out=out, quick=True, workers=1),
+        load=LoadOracle(),
+        sizes=Sizes(imagined=1, loop=1, controls=1, clips=1, acted=2),
+        baselines={"MAGE": LoadStill(24)},
+        measures=ST_LPIPS,
+    )
+    return out
+
+
+def test_the_study_as_a_whole(folder: Path) -> None:
+    found = Results.read(folder / "results.json")
+    assert set(found.headline) == {
+        "closed_loop_test", "closed_loop_unseen_colors", "closed_loop_more_objects",
+        "lpips_drop_unseen_colors", "lpips_drop_more_objects",
+        "lpips_drop_unseen_colors_mage", "lpips_drop_more_objects_mage",
+    }  # fmt: skip
+    assert [found.headline[f"closed_loop_{split}"] for split in SPLITS] == [1.0, 1.0, 1.0]
+    by_split = {r.split for r in found.rows if r.metric == "closed_loop_success" and r.method == "expert"}
+    assert by_split == set(SPLITS)
+    test, unseen = (found.find("ours", "9 frames", "st_lpips", s) for s in ("test", "unseen_colors"))
+    assert test is not None and unseen is not None
+    assert found.headline["lpips_drop_unseen_colors"] == pytest.approx(
+        unseen.value / test.value - 1, abs=1e-4
+    )
+
+
+def test_the_page_shows_bars_paper_and_clips(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    for words in (
+        "paper, MAGE-DINO",
+        "37.5 %",
+        "at least 0.75",
+        "LPIPS is absent: no weights here",
+        "Quick run",
+    ):
+        assert words in page
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*.*")}
+    assert {"clips/robustness-best-1.gif", "clips/robustness-worst-1.gif", "plots/drops.png"} <= files
+    assert any(name.startswith("clips/closed-loop-") for name in files)
