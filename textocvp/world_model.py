@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, TextOCVP
+from textocvp.requests import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
 from textocvp.rollout import Rollout
 
 DEFAULT_CHECKPOINT = "tabletop-small"
@@ -156,23 +156,12 @@ class WorldModel:
 
         A word that the text encoder has never met is a `UserWarning` that names the word.
         """
-        texts = self._checked_texts(text)
-        longest = self.longest_horizon
-        if not isinstance(horizon, (int, np.integer)) or horizon < 1:
-            raise ValueError(f"horizon must be a whole number of at least 1 frame, not {horizon!r}")
-        if longest is not None and horizon > longest:
-            raise ValueError(
-                f"horizon {horizon} is longer than this model was trained for: at most {longest}. To see "
-                "further, go on from where a rollout ended: rollout(previous_rollout, text)"
-            )
+        texts = checked_texts(text, self.model.text)
+        hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
+        checked_horizon(horizon, self.longest_horizon, hint)
         slots_BKD = self._first_slots(obs, seed)
-        scenes, sentences = slots_BKD.shape[0], len(texts)
-        if scenes != sentences and scenes != 1 and sentences != 1:
-            raise ValueError(
-                f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as "
-                "many of each"
-            )
-        B = max(scenes, sentences)
+        sentences = len(texts)
+        B = checked_pairs(slots_BKD.shape[0], sentences)
         texts = texts * B if sentences == 1 else texts
         seed_B1KD = slots_BKD.expand(B, -1, -1)[:, None]
         imagined = self.model.predictor.rollout(
@@ -209,7 +198,9 @@ class WorldModel:
         if frames.ndim != 5:
             raise ValueError(f"video must be (T, H, W, 3) or (B, T, H, W, 3), not {np.asarray(video).shape}")
         B, T = frames.shape[:2]
-        flat_N3HW = self._checked_images(frames.reshape(-1, *frames.shape[2:]), "video")
+        flat_N3HW = checked_frames(
+            frames.reshape(-1, *frames.shape[2:]), self.image_size, self.model.device, "video"
+        )
         parsed = self.model.parser(flat_N3HW.unflatten(0, (B, T)), generator=self._generator(seed))
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
@@ -223,8 +214,6 @@ class WorldModel:
             raise TypeError(f"a text must be a string, not {type(text).__name__}")
         return self.model.text.words(text)
 
-    # ---------------------------------------------------------------- checks
-
     def _first_slots(self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int) -> Tensor:
         if isinstance(obs, Rollout):
             if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
@@ -233,72 +222,8 @@ class WorldModel:
                     f"pixels, this model's are {self.model.parser.layout} at {self.image_size}"
                 )
             return obs.slots[:, -1].to(self.model.device)
-        if isinstance(obs, Mapping):
-            if "rgb" not in obs:
-                raise ValueError(
-                    f"the observation has no 'rgb'; it has {', '.join(map(repr, obs)) or 'nothing'}"
-                )
-            obs = obs["rgb"]
-        images = np.asarray(obs)
-        if images.ndim == 3:
-            images = images[None]
-        if images.ndim != 4:
-            raise ValueError(
-                f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}"
-            )
-        frames_B3HW = self._checked_images(images, "the observation")
+        frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)
         return self.model.parser(frames_B3HW[:, None], generator=self._generator(seed)).slots_BTKD[:, 0]
-
-    def _checked_images(self, images: np.ndarray, what: str) -> Tensor:
-        """(N, H, W, 3) uint8 images as frames (N, 3, H, W) in -1..1 on the model's device."""
-        H, W = self.image_size
-        if images.dtype != np.uint8:
-            hint = ""
-            if (
-                np.issubdtype(images.dtype, np.floating)
-                and images.size
-                and 0 <= images.min() <= images.max() <= 1
-            ):
-                hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)"
-            raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
-        if images.shape[-1] != 3 or images.shape[0] == 0:
-            raise ValueError(
-                f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}"
-            )
-        if images.shape[1:3] != (H, W):
-            raise ValueError(
-                f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} "
-                "and no other size: render or resize to that"
-            )
-        if images.max() == 1:
-            raise ValueError(
-                f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255"
-            )
-        frames_NHW3 = torch.from_numpy(np.array(images)).to(self.model.device)
-        return frames_NHW3.permute(0, 3, 1, 2).float() / 127.5 - 1
-
-    def _checked_texts(self, text: str | Sequence[str]) -> list[str]:
-        texts = [text] if isinstance(text, str) else list(text)
-        if not texts:
-            raise ValueError("no text: give one sentence or several")
-        for sentence in texts:
-            if not isinstance(sentence, str):
-                raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
-            if not sentence.strip():
-                raise ValueError(
-                    "an empty text; say what is to be done: 'put the red block in the blue bowl'"
-                )
-        unknown = list(
-            dict.fromkeys(word for sentence in texts for word in self.model.text.unknown_words(sentence))
-        )
-        if unknown:
-            words = ", ".join(map(repr, unknown))
-            warnings.warn(
-                f"the text encoder has never met {words}: what is imagined may be as if it were not there",
-                UserWarning,
-                stacklevel=4,
-            )
-        return texts
 
     def _generator(self, seed: int) -> torch.Generator:
         return torch.Generator(device=self.model.device).manual_seed(seed)
