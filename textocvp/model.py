@@ -107,24 +107,13 @@ class TextOCVP(
             CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is
                 named.
         """
-        folder = Path(pretrained_model_name_or_path)
-        if not folder.is_dir():
-            try:
-                found = snapshot_download(
-                    str(pretrained_model_name_or_path),
-                    revision=revision,
-                    cache_dir=cache_dir,
-                    local_files_only=local_files_only,
-                    token=token,
-                    allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"],
-                )
-            # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
-            except Exception as error:
-                raise CheckpointError(
-                    f"{str(pretrained_model_name_or_path)!r} is no folder here, and fetching it from "
-                    f"the Hugging Face hub failed: {type(error).__name__}: {error}"
-                ) from error
-            folder = Path(found)
+        folder = checkpoint_folder(
+            pretrained_model_name_or_path,
+            revision=revision,
+            cache_dir=cache_dir,
+            local_files_only=local_files_only,
+            token=token,
+        )
         config = read_config(folder)
         try:
             model = cls(config, folder / TEXT_FOLDER)
@@ -132,6 +121,29 @@ class TextOCVP(
             raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
         load_weights(model, folder / WEIGHTS_FILE)
         return model.to(device).eval()
+
+
+def checkpoint_folder(name: str | Path, **hub: Any) -> Path:
+    """The folder of that name, or the one into which the repository `name` of the Hugging Face hub was fetched.
+
+    Args:
+        hub: as in `huggingface_hub.snapshot_download`.
+
+    Raises:
+        CheckpointError: if there is neither.
+    """
+    folder = Path(name)
+    if folder.is_dir():
+        return folder
+    try:
+        patterns = [CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"]
+        return Path(snapshot_download(str(name), allow_patterns=patterns, **hub))
+    # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
+    except Exception as error:
+        raise CheckpointError(
+            f"{str(name)!r} is no folder here, and fetching it from the Hugging Face hub failed: "
+            f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def read_config(folder: Path) -> ModelConfig:
