@@ -13,16 +13,19 @@ most objects stand still, everything is measured once more on the named block an
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from experiments.protocol.arguments import StudyArgs, start
+from experiments.protocol.contenders import Absent, LoadVideo, find_contenders
 from experiments.protocol.figures import mean_row
 from experiments.protocol.object_gallery import ObjectPictures, choose_objects
 from experiments.protocol.object_report import (
+    FAR,
     METHODS,
     METRICS,
     MINUS,
@@ -36,9 +39,8 @@ from experiments.protocol.object_scenes import LENGTHS, MaskScores, ObjectOutcom
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
 from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
-from textocvp.world_model import bundled_checkpoints
 
-OCVP_SEQ = "ocvp-seq-small"
+FAR_CHECKPOINT = "tabletop-small-40"
 
 
 @dataclass
@@ -47,19 +49,31 @@ class Args(StudyArgs):
 
     Scenes come from the test seeds; the expert plays each, the model imagines it from the first frame and the sentence.
     Read the table's rows from below: `copy seed` is what standing still earns, `wrong text` what moving the wrong thing
-    earns, `true frames` what this parser can earn at best. A longer look ahead than 24 frames is measured where
-    the checkpoint can (the published moving window can, the causal one stops at what it was trained for).
+    earns, `true frames` what this parser can earn at best. Further than 24 frames is measured where the checkpoint can
+    look as far: a causal predictor stops at what it was trained for, the published moving window at 40.
     """
 
     out: Path = Path("results/objects")
     """Folder for results.json, report.html, plots and clips."""
-    ocvp_seq: str = OCVP_SEQ
-    """Checkpoint of the baseline without text; its rows stay empty while the default one is not there."""
+    ocvp_seq: str = "ocvp-seq-small"
+    """Checkpoint of OCVP-Seq, the baseline without text: a bundled name, a folder or a hub id."""
+    far: str = ""
+    """Checkpoint whose curves go on to 40 frames; empty: tabletop-small-40 beside tabletop-small, else none."""
 
     @property
     def sizes(self) -> Sizes:
         """How much is measured."""
         return QUICK if self.quick else DEFAULT
+
+    def others(self) -> tuple[dict[str, LoadWorldModel], list[Absent]]:
+        """The other models that imagine, and those that are not there."""
+        found, absent = find_contenders({"OCVP-Seq": LoadVideo(self.ocvp_seq)})
+        loads = {one.method: cast(LoadWorldModel, one.load) for one in found}
+        far = self.far or (FAR_CHECKPOINT if self.checkpoint == StudyArgs.checkpoint else "")
+        if far:
+            loads[FAR] = LoadCheckpoint(far)
+            loads[FAR]()  # a wrong name is an error now, not after the first scene
+        return loads, absent
 
 
 @dataclass(frozen=True)
@@ -86,7 +100,7 @@ def main(
     args: Args,
     load: LoadWorldModel | None = None,
     sizes: Sizes | None = None,
-    baseline: LoadWorldModel | None = None,
+    others: Mapping[str, LoadWorldModel] | None = None,
 ) -> Results:
     """Run the study and write its folder.
 
@@ -94,7 +108,7 @@ def main(
         args: the command line.
         load: makes the world model; by default loads `args.checkpoint`.
         sizes: how much is measured; by default what `args` ask for.
-        baseline: makes OCVP-Seq; by default loads `args.ocvp_seq`, if it is there.
+        others: method -> makes the model that it imagines with; by default those that `args` name.
 
     Raises:
         OSError: if the folder cannot be written, before any work is done.
@@ -105,22 +119,19 @@ def main(
     sizes = sizes or args.sizes
     started = time.monotonic()
     asked = load().checkpoint
-    absent = ""
-    if baseline is None:
-        if args.ocvp_seq == OCVP_SEQ and OCVP_SEQ not in bundled_checkpoints():
-            absent = f"no checkpoint {OCVP_SEQ!r} comes with this package"
-        else:
-            baseline = LoadCheckpoint(args.ocvp_seq)
-            baseline()  # a wrong name is an error now, not after the first scene
+    absent: list[Absent] = []
+    if others is None:
+        others, absent = args.others()
     pool = Pool(load, args.workers or available_cores())
-    units = [ObjectScene(scene, args.seed, baseline) for scene in test_scenes(SPLIT, sizes.scenes, args.seed)]
+    named = tuple(others.items())
+    units = [ObjectScene(scene, args.seed, named) for scene in test_scenes(SPLIT, sizes.scenes, args.seed)]
     parts = {"scenes": len(units), "pictures": 2 * min(sizes.clips, len(units))}
     outcomes: list[ObjectOutcome] = []
     with StudyProgress({part: (n, SECONDS[part]) for part, n in parts.items()}) as progress:
         for outcome in progress.track("scenes", pool.run(units)):
             outcomes.append(outcome)
             if len(outcomes) % 4 == 0:
-                progress.show(iou_table(method_rows(outcomes, ["iou"]), "iou", "Mask IoU", absent=absent))
+                progress.show(iou_table(method_rows(outcomes, ["iou"]), "iou", "Mask IoU"))
         chosen = choose_objects(outcomes, args.seed, sizes.clips, sizes.apart)
         pictures: list[ObjectPictures] = list(progress.track("pictures", pool.run(chosen)))
     rows = [*method_rows(outcomes, list(METRICS)), *difference_rows(outcomes)]
@@ -138,8 +149,8 @@ def main(
     with folder.fill() as partial:
         report.write(partial)
     progress.print(
-        iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True, absent=absent),
-        iou_table(rows, "iou_moving", "Mask IoU, named block and arm", absent=absent),
+        iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True),
+        iou_table(rows, "iou_moving", "Mask IoU, named block and arm"),
     )
     progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
     return results
@@ -165,7 +176,7 @@ def difference_rows(outcomes: Sequence[ObjectOutcome]) -> list[Row]:
     """Ours minus each other method, within each scene."""
     rows = []
     for method in METHODS:
-        if method == "ours" or any(method not in outcome.scores for outcome in outcomes):
+        if method in ("ours", FAR) or any(method not in outcome.scores for outcome in outcomes):
             continue
         for metric in ("iou", "iou_moving"):
             for length in LENGTHS:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from experiments.protocol.gallery import pixels
-from experiments.protocol.object_scenes import ObjectOutcome, horizon_of, resting, winners
+from experiments.protocol.object_scenes import ObjectOutcome, imagine, resting, winners
 from experiments.protocol.scenes import Drawn, Played, TestScene, draw, play
 from experiments.protocol.workers import Worker
 from experiments.reporting import Clip, Figure
@@ -49,12 +49,9 @@ class ObjectPicture:
 
     def run(self, worker: Worker) -> ObjectPictures:
         """Play and imagine it once more."""
-        model = worker.world_model
         drawn = draw(worker.environment(self.scene), self.scene)
         played = play(worker.environment(self.scene), drawn)
-        seen = drawn.observation["rgb"]
-        rollout = model.rollout(model.parse(seen[None], seed=self.seed), [drawn.texts[0]],
-                                horizon=horizon_of(model), seed=self.seed)  # fmt: skip
+        rollout = imagine(worker.world_model, drawn.observation["rgb"], drawn.texts[:1], self.seed)
         kind = "best" if self.best else "worst"
         clip = Clip(
             name=f"objects-{kind}-{self.rank}.gif",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,50 +128,39 @@ class ObjectScene:
     Attributes:
         scene: where.
         seed: of the slots.
-        baseline: makes OCVP-Seq, or None where there is none.
+        others: methods that imagine with another model under the same sentence: (name, makes it).
     """
 
     scene: TestScene
     seed: int
-    baseline: LoadWorldModel | None = None
+    others: tuple[tuple[str, LoadWorldModel], ...] = ()
 
     def run(self, worker: Worker) -> ObjectOutcome:
         """Play it, imagine it, compare."""
-        model = worker.world_model
         drawn = draw(worker.environment(self.scene), self.scene)
         # Played first: the simulator's frames are what everything is held against.
         played = play(worker.environment(self.scene), drawn)
-        length = horizon_of(model)
-        moved = named_block(drawn)
         wrong = wrong_text(drawn)
-        seen = drawn.observation["rgb"]
-        imagined = model.rollout(model.parse(seen[None], seed=self.seed), [drawn.texts[0], wrong],
-                                 horizon=length, seed=self.seed)  # fmt: skip
-        parsed = model.parse(played.frames, seed=self.seed)
-        ours, other = winners(imagined)
-        labels = {
-            "ours": ours,
-            "true frames": winners(parsed)[0],
-            "copy seed": np.repeat(ours[:1], length + 1, axis=0),
-            "wrong text": other,
+        model, seen = worker.world_model, drawn.observation["rgb"]
+        ours, other = winners(imagine(model, seen, [drawn.texts[0], wrong], self.seed))
+        labels = {"ours": ours, "wrong text": other}
+        for name, load in self.others:
+            labels[name] = winners(imagine(worker.other(load), seen, [drawn.texts[0]], self.seed))[0]
+        longest = max(map(len, labels.values()))
+        labels["copy seed"] = resting(ours[:1], longest)
+        labels["true frames"] = resting(winners(model.parse(played.frames, seed=self.seed))[0], longest)
+        moved = named_block(drawn)
+        scores = {
+            method: score_masks(labels_THW, resting(played.segmentations, len(labels_THW)), moved)
+            for method, labels_THW in labels.items()
         }
-        if self.baseline is not None:
-            deaf = worker.other(self.baseline)
-            ahead = deaf.rollout(deaf.parse(seen[None], seed=self.seed), [drawn.texts[0]],
-                                 horizon=horizon_of(deaf), seed=self.seed)  # fmt: skip
-            labels["OCVP-Seq"] = winners(ahead)[0]
-        scores = {}
-        for method, labels_THW in labels.items():
-            frames = len(labels_THW) if method != "true frames" else length + 1
-            scores[method] = score_masks(
-                resting(labels_THW, frames), resting(played.segmentations, frames), moved
-            )
         return ObjectOutcome(self.scene, drawn.texts[0], wrong, len(played.frames), scores)
 
 
-def horizon_of(model: StudyModel) -> int:
-    """How many frames a model is asked for: as many as it can, at most the longest of `LENGTHS`."""
-    return min(LENGTHS[-1], model.longest_horizon or LENGTHS[-1])
+def imagine(model: StudyModel, seen: np.ndarray, texts: Sequence[str], seed: int) -> Rollout:
+    """One scene under some texts, as far as the model can look ahead, at most the longest of `LENGTHS`."""
+    horizon = min(LENGTHS[-1], model.longest_horizon or LENGTHS[-1])
+    return model.rollout(model.parse(seen[None], seed=seed), list(texts), horizon=horizon, seed=seed)
 
 
 def named_block(drawn: Drawn) -> int:

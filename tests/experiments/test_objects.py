@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import objects
 from experiments.objects import Args, Sizes, main, method_rows
+from experiments.protocol import contenders
 from experiments.protocol.object_gallery import choose_objects
-from experiments.protocol.object_report import TRAINING
+from experiments.protocol.object_report import FAR
 from experiments.protocol.object_scenes import MaskScores, ObjectOutcome, ObjectScene, score_masks
 from experiments.protocol.scenes import draw, test_scenes, wrong_text
 from experiments.protocol.workers import Worker
@@ -74,7 +74,9 @@ def test_masks_must_fit_the_segmentation() -> None:
 @lru_cache
 def outcome(kind: str, ahead: int | None = 24) -> ObjectOutcome:
     (scene,) = test_scenes("test", 1, 0)
-    return ObjectScene(scene, 0, LoadForesight("copies")).run(Worker(LoadForesight(kind, ahead)()))  # type: ignore[arg-type]
+    return ObjectScene(scene, 0, (("OCVP-Seq", LoadForesight("copies")),)).run(
+        Worker(LoadForesight(kind, ahead)())
+    )  # type: ignore[arg-type]
 
 
 def assert_same(a: MaskScores, b: MaskScores) -> None:
@@ -109,6 +111,7 @@ def test_a_model_that_can_look_further_is_measured_further() -> None:
         "frames 1-9",
         "frame 9",
     }
+    assert near.scores["copy seed"].iou.shape == (25,)  # as long as the longest of all methods
     # The scene rests in its last frame after the episode.
     assert len(set(far.scores["true frames"].iou[far.frames - 1 :].tolist())) == 1
 
@@ -143,12 +146,17 @@ def test_the_worst_and_the_best_are_those_with_the_least_and_most_overlap() -> N
     ]
 
 
+def not_there(name: str) -> None:
+    raise CheckpointError(f"unknown checkpoint {name!r}")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(objects, "bundled_checkpoints", lambda: [])
-        main(Args(out=out, quick=True, workers=1), LoadForesight("sees"), Sizes(scenes=1, clips=1, apart=1))
+        patch.setattr(contenders, "load_video_model", not_there)
+        args = Args(out=out, checkpoint="mine", quick=True, workers=1)
+        main(args, LoadForesight("sees"), Sizes(scenes=1, clips=1, apart=1))
     return out
 
 
@@ -167,7 +175,8 @@ def test_the_figures_are_there_with_intervals(folder: Path) -> None:
 
 def test_the_page_shows_what_is_absent_and_every_slot(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    assert TRAINING in page and "comes with this package" in page and "Quick run" in page
+    assert "OCVP-Seq is absent: not trained: `textocvp train predictor --preset ocvp-seq-small" in page
+    assert "Quick run" in page
     assert "paper, Copy-Seed" in page and "0.525" in page
     names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}
     assert {"plots/iou.png", "plots/iou_moving.png", "plots/objects-apart-worst-1.png"} <= names
@@ -175,6 +184,13 @@ def test_the_page_shows_what_is_absent_and_every_slot(folder: Path) -> None:
 
 
 def test_an_unknown_baseline_is_an_early_error(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no-such-model"):
-        main(Args(out=tmp_path / "r", ocvp_seq="no-such-model"), LoadForesight("sees"))
+    for named in ({"ocvp_seq": "no-such-model"}, {"far": "no-such-model"}):
+        with pytest.raises(CheckpointError, match="no-such-model"):
+            main(Args(out=tmp_path / "r", **named), LoadForesight("sees"))  # type: ignore[arg-type]
     assert list((tmp_path / "r").iterdir()) == []
+
+
+def test_the_shipped_model_goes_on_with_the_one_for_40_frames() -> None:
+    loads, _ = Args().others()
+    assert loads[FAR]().longest_horizon == 40
+    assert FAR not in Args(checkpoint="mine").others()[0]
