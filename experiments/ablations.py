@@ -1,0 +1,196 @@
+"""Ablations: what each choice of architecture is worth, every one trained from the same slots with as many updates.
+
+    python experiments/ablations.py --runs runs/ablations              # default: about 10 minutes on 2 cores
+    python experiments/ablations.py --runs runs/ablations --quick      # a first look
+
+    python experiments/train_ablations.py --data data/tabletop-train.h5 --val data/tabletop-val.h5   # trains the runs
+
+Depth, residual connection, text encoder, first slots and decoder, and the number of slots at test time, in the layout
+of the paper's tables. Measured on scenes that no training has seen; a run that is not there is a row that says so and
+names the command that trains it. Writes `results.json`, `report.html` and plots into `--out`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.protocol.ablation_report import build_report, parser_table, predictor_table
+from experiments.protocol.ablation_rows import (
+    SHIPPED,
+    SLOT_COUNTS,
+    following_rows,
+    headline,
+    parsing_rows,
+    slots_name,
+)
+from experiments.protocol.ablation_runs import RUNS, FoundRun, find_run
+from experiments.protocol.ablation_scenes import (
+    Entrant,
+    FollowingOutcome,
+    FollowingScene,
+    LoadSlots,
+    ParsingOutcome,
+    ParsingScene,
+)
+from experiments.protocol.arguments import StudyArgs, start
+from experiments.protocol.frame_scores import available_measures
+from experiments.protocol.scenes import test_scenes
+from experiments.protocol.workers import LoadCheckpoint, Pool, available_cores
+from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgress, package_versions
+from textocvp.model import CheckpointError
+
+VARIANTS = 3
+WITHOUT_JEDI = "the ablation study compares single frames only"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured, in scenes.
+
+    Attributes:
+        following: of the predictors, with four instructions each. unseen: of unseen caption colours, with one.
+        parsing: episodes that the parsers take apart. slots: of each number of objects, for every slot count.
+    """
+
+    following: int
+    unseen: int
+    parsing: int
+    slots: int
+
+
+QUICK = Sizes(following=8, unseen=6, parsing=4, slots=4)
+DEFAULT = Sizes(following=60, unseen=40, parsing=30, slots=30)
+
+
+@dataclass
+class Args(StudyArgs):
+    """Measure the ablation runs."""
+
+    out: Path = Path("results/ablations")
+    """Folder for results.json, report.html and plots."""
+    runs: Path = Path("runs/ablations")
+    """Folder of the runs, from `python experiments/train_ablations.py`."""
+
+
+def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SLOT_COUNTS) -> Results:
+    """Run the study and write its folder.
+
+    Args:
+        args: the command line.
+        sizes: how much is measured; by default what `args` ask for.
+        slot_counts: numbers of slots that the parser is given at test time.
+
+    Raises:
+        OSError: if the folder cannot be written, before any work is done.
+        CheckpointError: if there is no such checkpoint, or a run's configuration is damaged, before any work is done.
+    """
+    folder = OutputFolder(args.out)
+    sizes = sizes or (QUICK if args.quick else DEFAULT)
+    load = LoadCheckpoint(args.checkpoint)
+    started = time.monotonic()
+    asked = load().checkpoint
+    found, hashes = look(args.runs)
+    shipped = Entrant(SHIPPED, LoadSlots(args.checkpoint))
+    entrants = {
+        stage: (
+            shipped,
+            *(entrant_of(one) for one in found if one.run.stage == stage and one.state == "trained"),
+        )
+        for stage in ("predictor", "parser")
+    }
+    counts = tuple(Entrant(slots_name(k), LoadSlots(args.checkpoint, k)) for k in slot_counts)
+    measures = available_measures(None, (), WITHOUT_JEDI)
+    following = [
+        *(
+            FollowingScene(scene, entrants["predictor"], VARIANTS, args.seed, measures)
+            for scene in test_scenes("controllability", sizes.following, args.seed)
+        ),
+        *(
+            FollowingScene(scene, entrants["predictor"], 0, args.seed)
+            for scene in test_scenes("unseen_colors", sizes.unseen, args.seed)
+        ),
+    ]
+    parsing = [
+        ParsingScene(scene, entrants["parser"], args.seed)
+        for scene in test_scenes("test", sizes.parsing, args.seed)
+    ]
+    counted = [
+        scene for split in ("test", "more_objects") for scene in test_scenes(split, sizes.slots, args.seed)
+    ]
+    followed: list[FollowingOutcome] = []
+    parsed: list[ParsingOutcome] = []
+    pool = Pool(load, args.workers or available_cores())
+    # Rough seconds of a unit on one core; they only weigh the parts in the progress bar.
+    parts = {
+        "predictors": (len(following), 0.6 * len(entrants["predictor"])),
+        "parsers": (len(parsing), 1.0 * len(entrants["parser"])),
+        "slot counts, parsed": (len(counted), 0.5 * len(counts)),
+        "slot counts, imagined": (len(counted), 0.2 * len(counts)),
+    }
+    with StudyProgress(parts) as progress:
+        for outcome in progress.track("predictors", pool.run(following)):
+            followed.append(outcome)
+            progress.show(predictor_table(following_rows(followed), found))
+        for parsing_outcome in progress.track("parsers", pool.run(parsing)):
+            parsed.append(parsing_outcome)
+            progress.show(parser_table(parsing_rows(parsed), found))
+        units = [ParsingScene(scene, counts, args.seed) for scene in counted]
+        parsed += progress.track("slot counts, parsed", pool.run(units))
+        imagined = [FollowingScene(scene, counts, 0, args.seed) for scene in counted]
+        followed += progress.track("slot counts, imagined", pool.run(imagined))
+    rows = following_rows(followed) + parsing_rows(parsed)
+    results = Results(
+        study="ablations",
+        checkpoint=Checkpoint(asked.name, asked.sha256),
+        versions=package_versions() | {f"run {name}": sha for name, sha in hashes.items()},
+        seeds=seeds_used(args.seed, [*following, *parsing, *imagined]),
+        quick=args.quick,
+        seconds=round(time.monotonic() - started, 1),
+        rows=rows,
+        headline=headline(rows),
+    )
+    report = build_report(results, found, slot_counts, measures, args.command("ablations"))
+    with folder.fill() as partial:
+        report.write(partial)
+    progress.print(predictor_table(rows, found), parser_table(rows, found))
+    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    return results
+
+
+def look(runs: Path) -> tuple[list[FoundRun], dict[str, str]]:
+    """What there is of every run, and the first 16 digits of the SHA-256 of those that can be measured.
+
+    A trained run that cannot be loaded here (its text encoder may need a package) is in the state `unusable`.
+    """
+    found, hashes = [], {}
+    for run in RUNS:
+        one = find_run(run, runs)
+        if one.state == "trained":
+            try:
+                hashes[run.name] = entrant_of(one).load().checkpoint.sha256[:16]
+            except (CheckpointError, ImportError, OSError, RuntimeError) as error:
+                one = FoundRun(run, one.folder, "unusable", str(error), one.updates)
+        found.append(one)
+    return found, hashes
+
+
+def entrant_of(found: FoundRun) -> Entrant:
+    """The model of a trained run."""
+    return Entrant(found.run.name, LoadSlots(str(found.checkpoint)))
+
+
+def seeds_used(seed: int, units: Sequence[FollowingScene | ParsingScene]) -> dict[str, list[int]]:
+    """Every seed, by what it was used for."""
+    seeds: dict[str, list[int]] = {"slots": [seed]}
+    for unit in units:
+        known = seeds.setdefault(f"scenes, {unit.scene.split}", [])
+        if unit.scene.seed not in known:
+            known.append(unit.scene.seed)
+    return seeds
+
+
+if __name__ == "__main__":
+    start(main, Args)

@@ -1,0 +1,115 @@
+"""Timing: turns, medians, what is left out, and a whole study with the shipped checkpoint at its smallest."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.protocol.runtime_rows import OURS, WINDOW, cell_rows, headline, query_rows, ratio_rows
+from experiments.protocol.runtime_subjects import Cell, published_form
+from experiments.protocol.timing import machine_in_words, median_interval, race
+from experiments.runtime import Args, Sizes, all_cells, foreseen, main
+from tests.textocvp.conftest import PLACED, build
+from textocvp.world_model import WorldModel
+
+
+class Watch:
+    """A clock that only work moves on."""
+
+    def __init__(self) -> None:
+        self.now, self.turns = 0.0, []
+
+    def takes(self, name: str, seconds: float):
+        def work() -> None:
+            self.turns.append(name)
+            self.now += seconds
+
+        return work
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_all_have_their_turn_in_every_round() -> None:
+    watch = Watch()
+    timed = race({"a": watch.takes("a", 1.0), "b": watch.takes("b", 2.0)}, 4, 100, watch)
+    assert timed["a"].tolist() == [1.0] * 4 and timed["b"].tolist() == [2.0] * 4
+    # One round that does not count, and then another one starts each time.
+    assert "".join(watch.turns) == "ab" + "ab" + "ba" + "ab" + "ba"
+
+
+def test_slow_work_is_cut_short_after_three_rounds() -> None:
+    watch = Watch()
+    assert len(race({"a": watch.takes("a", 50.0)}, 20, 100, watch)["a"]) == 3
+    assert len(race({"a": watch.takes("a", 10.0)}, 20, 100, watch)["a"]) == 10
+
+
+def test_the_median_has_an_interval_of_order_statistics() -> None:
+    # n = 15: the 4th smallest to the 4th largest cover 96.5 % (textbook table of the sign test).
+    interval = median_interval(np.arange(15.0)[::-1])
+    assert (interval.value, interval.low, interval.high, interval.n) == (7.0, 3.0, 11.0, 15)
+    assert median_interval(np.arange(6.0)).low == 0.0
+    few = median_interval(np.array([3.0, 1.0, 2.0]))
+    assert (few.value, few.low, few.high) == (2.0, 1.0, 3.0)
+    with pytest.raises(ValueError, match="no values"):
+        median_interval(np.array([]))
+
+
+def test_what_would_take_too_long_is_foreseen_from_the_nearest_smaller_one() -> None:
+    seconds = {
+        ("a", Cell("decode", 1, 1, 1)): np.array([0.1]),
+        ("a", Cell("decode", 9, 1, 1)): np.array([0.45]),
+        ("a", Cell("predict", 9, 1, 1)): np.array([70.0]),
+        ("b", Cell("decode", 9, 1, 1)): np.array([80.0]),
+    }
+    assert foreseen("a", Cell("decode", 9, 16, 1), seconds) == pytest.approx(0.45 * 16)
+    assert foreseen("a", Cell("decode", 9, 16, 2), seconds) == 0.0
+    cells = all_cells(Sizes((1, 9), (1, 16), 3, 1.0, 1.0, threads=(1, 2)))
+    assert len(cells) == len(set(cells)) == 2 * 2 * (1 + 3 * 2)
+
+
+def test_ratios_are_of_rounds_not_of_medians() -> None:
+    cell = Cell("predict", 9, 1, 1)
+    # A burst of other work in the second round slows both alike.
+    seconds = {(OURS, cell): np.array([1.0, 10.0, 1.0]), (WINDOW, cell): np.array([3.0, 30.0, 3.0])}
+    (row,) = ratio_rows(seconds, {})
+    assert (row.method, row.value, row.low, row.high, row.n) == (f"{WINDOW} / {OURS}", 3.0, 3.0, 3.0, 3)
+    rows = [*cell_rows(seconds), row, *query_rows({1: {OURS: np.array([0.5, 0.5])}})]
+    assert headline(rows, 1) == {"window_over_cache_9_frames": 3.0, "planning_queries_per_second": 2.0}
+
+
+def test_decoding_is_compared_with_predicting() -> None:
+    seconds = {
+        (OURS, Cell("predict", 9, 1, 1)): np.array([2.0]),
+        (OURS, Cell("decode", 9, 1, 1)): np.array([8.0]),
+    }
+    (row,) = ratio_rows(seconds, {})
+    assert (row.method, row.value) == (f"{OURS}: decode / predict", 4.0)
+
+
+def test_the_published_form_has_the_same_sizes() -> None:
+    ours = WorldModel(build(PLACED))
+    window = published_form(ours)
+    assert window.model.config.predictor.attention == "window" and window.longest_horizon is None
+
+    def parameters(model: WorldModel) -> int:
+        return sum(p.numel() for name, p in model.model.named_parameters() if name != "predictor.ages")
+
+    assert parameters(window) == parameters(ours)
+
+
+def test_a_whole_study(tmp_path: Path) -> None:
+    tiny = Sizes(frames=(1, 2), batches=(1, 2), repeats=3, seconds=0.0, longest=5.0, threads=(1,))
+    main(Args(out=tmp_path, quick=True), sizes=tiny, paper=False)
+    data = json.loads((tmp_path / "results.json").read_text())
+    assert data["study"] == "runtime" and data["versions"]["machine"] == machine_in_words()
+    assert data["headline"]["planning_queries_per_second"] > 0
+    found = {(row["method"], row["split"], row["variant"]): row for row in data["rows"]}
+    assert found[OURS, "1 thread", "encode, 1 x 2"]["n"] == 3
+    for phase in ("predict", "decode", "all"):
+        for frames in (1, 2):
+            assert (OURS, "1 thread", f"{phase}, {frames} x 2") in found
+    assert (WINDOW, "1 thread", "decode, 1 x 1") not in found
+    page = (tmp_path / "report.html").read_text()
+    assert "untrained, timing only" in page and "Quick run." in page
