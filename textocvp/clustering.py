@@ -59,7 +59,7 @@ class ClusterInitializer(nn.Module):
     """Farthest-point seeds, a few k-means rounds, then touching clusters of one colour united.
 
     Args:
-        seeds: how many clusters to start from, the background not counted.
+        seeds: how many clusters to start from, the background not counted; more where more slots are asked for.
         rounds: k-means rounds.
         background_distance: squared feature distance from the image's median colour above which a pixel can seed.
         same_chroma, same_luminance: touching clusters closer than this in chroma (sum over channels) and luminance
@@ -104,16 +104,19 @@ class ClusterInitializer(nn.Module):
         background_B1C = colors_BNC.median(dim=1, keepdim=True).values
         to_background_BN = (colors_BNC - background_B1C).square().sum(-1)
 
-        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W)
+        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots)
         onehot_BNS = self._k_means(points_BNC, to_background_BN, centers_BSC, used_BS)
         onehot_BSN = self._unite(onehot_BNS.transpose(1, 2), colors_BNC, H, W)
         return self._largest(onehot_BSN, num_slots, H, W)
 
-    def _seed(self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int) -> tuple[Tensor, Tensor]:
+    def _seed(
+        self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int, num_slots: int
+    ) -> tuple[Tensor, Tensor]:
         B, _, C = points_BNC.shape
         nearest_BN = to_background_BN.clone()
         centers, used = [], []
-        for _ in range(self.seeds):
+        # A thing may take two seeds, so where more slots are asked for there are more seeds, too.
+        for _ in range(max(self.seeds, num_slots + 2)):
             # Blurred, so that a seed lies inside a region and not on an odd pixel of its edge.
             smooth_BN = F.avg_pool2d(nearest_BN.view(B, 1, H, W), 3, 1, 1, count_include_pad=False).flatten(1)
             smooth_BN = torch.where(

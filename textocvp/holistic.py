@@ -17,6 +17,18 @@ from textocvp.parser import Parsed, SceneParser
 from textocvp.savi import PositionCode
 
 
+def keep_size(module: nn.Module) -> None:
+    """Initial weights with which ReLU layers pass the picture on at its size (He et al. 2015).
+
+    With PyTorch's own it shrinks layer by layer, and an autoencoder draws the mean picture for hundreds of updates.
+    """
+    for layer in module.modules():
+        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+
 class HolisticParser(SceneParser):
     """Frames to one slot each: four convolutions that halve the frame three times, average pooling, a linear layer.
 
@@ -53,6 +65,7 @@ class HolisticParser(SceneParser):
         self.position = PositionCode(wide)
         self.mix = nn.Sequential(nn.ReLU(), nn.Conv2d(wide, 2 * wide, 3, padding=1), nn.ReLU())
         self.slot = nn.Linear(2 * wide * config.pool_cells**2, config.layout.dim)
+        keep_size(self)
 
     def forward(
         self,

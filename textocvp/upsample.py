@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from textocvp.config import RendererConfig
+from textocvp.holistic import keep_size
 from textocvp.renderer import Rendered, Renderer
 from textocvp.slots import SlotLayout
 
@@ -47,6 +48,7 @@ class UpsampleRenderer(Renderer):
         last = wide if doublings == 1 else config.channels
         blocks += [nn.ReLU(), nn.Conv2d(last, 3 * 4, 3, padding=1), nn.PixelShuffle(2)]
         self.convolutions = nn.Sequential(*blocks)
+        keep_size(self)
 
     def forward(self, slots_B1D: Tensor) -> Rendered:
         """See `Renderer`.

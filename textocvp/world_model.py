@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, TextOCVP
+from textocvp.parser import Parsed
 from textocvp.requests import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
 from textocvp.rollout import Rollout
 
@@ -128,6 +129,7 @@ class WorldModel:
         *,
         horizon: int = 24,
         seed: int = 0,
+        num_slots: int | None = None,
         attention: bool = False,
         use_cache: bool = True,
     ) -> Rollout:
@@ -142,6 +144,8 @@ class WorldModel:
             text: what is to be done.
             horizon: how many frames to imagine after the one that is seen.
             seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
+            num_slots: how many slots to look for in an image, background included: more than the model was
+                trained with for scenes of more things. The configured number by default.
             attention: also keep the weights from slots to words.
             use_cache: reuse the keys and values of past frames; without it they are computed again at every
                 step (slower, the same up to rounding; for checks).
@@ -159,7 +163,7 @@ class WorldModel:
         texts = checked_texts(text, self.model.text)
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
         checked_horizon(horizon, self.longest_horizon, hint)
-        slots_BKD = self._first_slots(obs, seed)
+        slots_BKD = self._first_slots(obs, seed, num_slots)
         sentences = len(texts)
         B = checked_pairs(slots_BKD.shape[0], sentences)
         texts = texts * B if sentences == 1 else texts
@@ -177,17 +181,19 @@ class WorldModel:
         *,
         horizon: int,
         seed: int = 0,
+        num_slots: int | None = None,
     ) -> Tensor:
         """Only the frames (B, horizon + 1, 3, H, W) of `rollout`, as every `textocvp.video.VideoModel` gives them."""
-        return self.rollout(obs, text, horizon=horizon, seed=seed).frames
+        return self.rollout(obs, text, horizon=horizon, seed=seed, num_slots=num_slots).frames
 
     @torch.no_grad()
-    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+    def parse(self, video: np.ndarray, *, seed: int = 0, num_slots: int | None = None) -> Rollout:
         """Slots of true frames, nothing imagined: what a perfect prediction would be measured at.
 
         Args:
             video: (T, H, W, 3) or (B, T, H, W, 3) uint8.
             seed: of the initial slots.
+            num_slots: how many slots to use, as in `rollout`.
 
         Raises:
             TypeError, ValueError: as `rollout`.
@@ -201,7 +207,7 @@ class WorldModel:
         flat_N3HW = checked_frames(
             frames.reshape(-1, *frames.shape[2:]), self.image_size, self.model.device, "video"
         )
-        parsed = self.model.parser(flat_N3HW.unflatten(0, (B, T)), generator=self._generator(seed))
+        parsed = self._parsed(flat_N3HW.unflatten(0, (B, T)), seed, num_slots)
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
     def words(self, text: str) -> list[str]:
@@ -214,8 +220,21 @@ class WorldModel:
             raise TypeError(f"a text must be a string, not {type(text).__name__}")
         return self.model.text.words(text)
 
-    def _first_slots(self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int) -> Tensor:
+    def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Parsed:
+        if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
+            raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
+        generator = torch.Generator(device=self.model.device).manual_seed(seed)
+        return self.model.parser(frames_BT3HW, num_slots=num_slots, generator=generator)
+
+    def _first_slots(
+        self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int, num_slots: int | None
+    ) -> Tensor:
         if isinstance(obs, Rollout):
+            if num_slots is not None and num_slots != obs.slots.shape[2]:
+                raise ValueError(
+                    f"this rollout goes on with its own {obs.slots.shape[2]} slots; num_slots = {num_slots} is "
+                    "for images"
+                )
             if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
                 raise ValueError(
                     f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} "
@@ -223,10 +242,7 @@ class WorldModel:
                 )
             return obs.slots[:, -1].to(self.model.device)
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)
-        return self.model.parser(frames_B3HW[:, None], generator=self._generator(seed)).slots_BTKD[:, 0]
-
-    def _generator(self, seed: int) -> torch.Generator:
-        return torch.Generator(device=self.model.device).manual_seed(seed)
+        return self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
 
     def _as_rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...], attention: Tensor | None) -> Rollout:
         return Rollout(
