@@ -14,7 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.world_model import DEFAULT_CHECKPOINT, Checkpoint, WorldModel
+from textocvp.located import DEFAULT_CHECKPOINT, Checkpoint, located
+from textocvp.mage.config import ARCHITECTURE
+from textocvp.mage.video import MageVideoModel
+from textocvp.model import read_json
+from textocvp.world_model import WorldModel
 
 
 class VideoModel(Protocol):
@@ -54,4 +58,8 @@ def load_video_model(
     name_or_folder_or_hub_id: str | Path = DEFAULT_CHECKPOINT, device: str | torch.device = "cpu"
 ) -> VideoModel:
     """The model of a checkpoint, whatever its architecture; arguments and errors as `WorldModel.from_pretrained`."""
-    return WorldModel.from_pretrained(name_or_folder_or_hub_id, device)
+    name = str(name_or_folder_or_hub_id)
+    with located(name) as folder:
+        if read_json(folder).get("architecture") == ARCHITECTURE:
+            return MageVideoModel.from_folder(folder, name, device)
+    return WorldModel.from_pretrained(name, device)

@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -14,33 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, TextOCVP
+from textocvp.located import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, located
+from textocvp.model import TextOCVP
 from textocvp.parser import Parsed
 from textocvp.requests import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
 from textocvp.rollout import Rollout
 
-DEFAULT_CHECKPOINT = "tabletop-small"
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Where a model came from.
-
-    Attributes:
-        name: the bundled name, the folder or the hub id that was asked for.
-        sha256: of its `model.safetensors`; empty for a model that was never saved.
-    """
-
-    name: str
-    sha256: str = ""
-
-
-def bundled_checkpoints() -> list[str]:
-    """Names of the checkpoints that come with the package."""
-    root = files("textocvp") / "checkpoints"
-    if not root.is_dir():
-        return []
-    return sorted(folder.name for folder in root.iterdir() if (folder / CONFIG_FILE).is_file())
+__all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
 
 
 class WorldModel:
@@ -71,28 +48,8 @@ class WorldModel:
                 damaged.
         """
         name = str(name_or_folder_or_hub_id)
-        if name in bundled_checkpoints():
-            with as_file(files("textocvp") / "checkpoints" / name) as folder:
-                return cls._from_folder(folder, name, device)
-        if Path(name).is_dir():
-            return cls._from_folder(Path(name), name, device)
-        bundled = ", ".join(bundled_checkpoints()) or "none"
-        allowed = (
-            f"Bundled checkpoints: {bundled}. Else give a folder that contains {CONFIG_FILE} and "
-            f"{WEIGHTS_FILE}, or the id owner/name of a repository on the Hugging Face hub that does."
-        )
-        if name.count("/") != 1 or name.startswith((".", "/", "~")):
-            raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
-        try:
-            model = TextOCVP.from_pretrained(name, device=device)
-        except CheckpointError as error:
-            raise CheckpointError(f"unknown checkpoint {name!r}: {error}. {allowed}") from error
-        return cls(model, Checkpoint(name))
-
-    @classmethod
-    def _from_folder(cls, folder: Path, name: str, device: str | torch.device) -> WorldModel:
-        model = TextOCVP.from_pretrained(folder, device=device)
-        return cls(model, Checkpoint(name, hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()))
+        with located(name) as folder:
+            return cls(TextOCVP.from_pretrained(folder, device=device), Checkpoint.of(folder, name))
 
     def __repr__(self) -> str:
         config = self.model.config

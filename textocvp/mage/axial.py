@@ -84,6 +84,7 @@ class AxialTransformer(nn.Module):
                 nn.init.normal_(weight, std=(2 * C * config.layers) ** -0.5)
         self.blocks = nn.ModuleList(blocks)
         self.out = nn.Linear(C, p**2 * codebook_size)
+        self.keep = nn.Linear(C, 2 * p**2) if config.copy else None
 
     def patches(self, codes: Tensor) -> Tensor:
         """Codes (..., h, w) as the codes (..., g, g, P) of each token."""
@@ -137,11 +138,18 @@ class AxialTransformer(nn.Module):
         tokens_BTggC = self.tokens(codes_BThw)
         anchor_B1ggC = self.start(tokens_BTggC[:, 0], text, speed_B)
         x_BTggC = self.layers(torch.cat([anchor_B1ggC, self.enter_frames(tokens_BTggC)], dim=1))[:, 1:]
-        return self.scores(x_BTggC)
+        return self.scores(x_BTggC, codes_BThw, codes_BThw[:, :1])
 
-    def scores(self, x_BTggC: Tensor) -> Tensor:
-        """(B, T, g, g, P, K)"""
-        return self.out(x_BTggC).unflatten(-1, (self.config.patch**2, -1))
+    def scores(self, x_BTggC: Tensor, codes_BThw: Tensor, first_B1hw: Tensor) -> Tensor:
+        """(B, T, g, g, P, K) from what the layers say, the codes of these frames, and those of the first frame."""
+        P = self.config.patch**2
+        scores_BTggPK = self.out(x_BTggC).unflatten(-1, (P, -1))
+        if self.keep is None:
+            return scores_BTggPK
+        bonus_BTggP2 = self.keep(x_BTggC).unflatten(-1, (P, 2)).to(scores_BTggPK.dtype)
+        kept = torch.stack([codes_BThw, first_B1hw.expand_as(codes_BThw)], dim=-1)
+        kept_BTggP2 = self.patches(kept.movedim(-1, 0)).movedim(0, -1)
+        return scores_BTggPK.scatter_add(-1, kept_BTggP2, bonus_BTggP2)
 
     @torch.no_grad()
     def imagine(
@@ -182,12 +190,13 @@ class AxialTransformer(nn.Module):
         tokens_BTggC = self.tokens(seen_BThw)
         anchor_B1ggC = self.start(tokens_BTggC[:, 0], text, speed_B)
         x_BTggC = torch.cat([anchor_B1ggC, self.enter_frames(tokens_BTggC)], dim=1)
-        imagined = []
+        newest_B1hw, imagined = seen_BThw[:, -1:], []
         for _ in range(horizon):
-            x_BTggC = self.layers(x_BTggC, caches)[:, -1:]
-            imagined.append(self.frames(self.scores(x_BTggC)[:, 0].argmax(-1)))
-            x_BTggC = self.enter_frames(self.tokens(imagined[-1][:, None]))
-        return torch.stack(imagined, dim=1)
+            scores_B1ggPK = self.scores(self.layers(x_BTggC, caches)[:, -1:], newest_B1hw, seen_BThw[:, :1])
+            newest_B1hw = self.frames(scores_B1ggPK.argmax(-1))
+            imagined.append(newest_B1hw)
+            x_BTggC = self.enter_frames(self.tokens(newest_B1hw))
+        return torch.cat(imagined, dim=1)
 
 
 def code_loss(scores: Tensor, codes: Tensor, weights: Tensor) -> Tensor:

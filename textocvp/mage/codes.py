@@ -59,7 +59,7 @@ def vqvae_fingerprint(model: VQVAE) -> str:
     return digest.hexdigest()
 
 
-def cached_codes(model: VQVAE, episodes: EpisodeFile, path: Path, *, batch: int = 8) -> CodeCache:
+def cached_codes(model: VQVAE, episodes: EpisodeFile, path: Path, *, batch: int = 2) -> CodeCache:
     """The codes of all episodes: read from `path` if they are there, else computed and written there.
 
     Raises:

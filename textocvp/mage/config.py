@@ -71,6 +71,9 @@ class AxialConfig:
         frames: the longest video, in frames, the seen one included.
         patch: side of the square of codes that make one token. 1 as published; 2 makes a frame of 16x16 codes 64
             tokens and so four times as cheap, with all codes of a frame still predicted at once.
+        copy: add to the score of the code that a place has now, and of the one it had in the first frame, a bonus that
+            is read off the token: standing still and being seen again need then not be learned code by code. Not
+            published; for training in minutes.
     """
 
     dim: int = 512
@@ -79,6 +82,7 @@ class AxialConfig:
     hidden: int = 2048
     frames: int = 20
     patch: int = 1
+    copy: bool = False
 
 
 @dataclass(frozen=True)

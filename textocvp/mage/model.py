@@ -15,6 +15,8 @@ from textocvp.mage.text import build_text
 from textocvp.mage.vqvae import VQVAE
 from textocvp.model import CONFIG_FILE, TEXT_FOLDER, WEIGHTS_FILE, CheckpointError, load_weights, read_json
 
+AT_ONCE = 64  # frames to decode: more take more memory, and on a CPU more time each
+
 
 class Mage(nn.Module):
     """Frames to codes, codes and text to the codes to come, codes to frames ("Make It Move", CVPR 2022, figure 2).
@@ -64,7 +66,8 @@ class Mage(nn.Module):
         seen_B1hw = self.vqvae.encode(first_B3HW)[:, None]
         imagined_BShw = self.axial.imagine(seen_B1hw, self.text(texts), horizon, use_cache=use_cache)
         codes_BThw = torch.cat([seen_B1hw, imagined_BShw], dim=1)
-        return self.vqvae.decode(codes_BThw.flatten(0, 1)).unflatten(0, codes_BThw.shape[:2])
+        drawn = [self.vqvae.decode(part) for part in codes_BThw.flatten(0, 1).split(AT_ONCE)]
+        return torch.cat(drawn).unflatten(0, codes_BThw.shape[:2])
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint."""
