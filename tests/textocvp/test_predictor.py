@@ -150,8 +150,10 @@ def test_one_step_of_a_rollout_is_the_teacher_forced_prediction(kind, attention)
     torch.testing.assert_close(forced, rolled, atol=1e-5, rtol=1e-4)
 
 
-def test_text_padding_changes_nothing():
-    model, slots, tokens = build(), scene(), text()
+@both_forms
+@both_layouts
+def test_text_padding_changes_nothing(attention, layout):
+    model, slots, tokens = build(attention, layout), scene(layout), text()
     with torch.no_grad():
         together = model.rollout(slots, tokens, 3).slots_BSKD
         alone = model.rollout(slots[:1], text(TEXTS[:1]), 3).slots_BSKD

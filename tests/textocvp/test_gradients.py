@@ -1,0 +1,50 @@
+"""Stage 2's gradients: from drawn frames through the frozen renderer into what is trained, and into nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.textocvp.conftest import PLACED, PUBLISHED, build
+from tests.textocvp.test_holistic import NON_OC
+from textocvp.config import ModelConfig
+from textocvp.train_predictor import Dynamics, PredictorTraining, assemble
+
+
+def variant(config: ModelConfig, **changes: object) -> ModelConfig:
+    return replace(config, predictor=replace(config.predictor, **changes))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        PLACED,
+        PUBLISHED,
+        NON_OC,
+        variant(PLACED, kind="ocvp-seq", color_bias=False),
+        variant(PUBLISHED, kind="ocvp-seq"),
+    ],
+    ids=lambda config: f"{config.name}-{config.predictor.kind}",
+)
+def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: Path) -> None:
+    build(config).save_pretrained(tmp_path)
+    nowhere = Path()
+    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=tmp_path))
+    frames_B1 = torch.rand(2, 1, 3, 32, 32) * 2 - 1
+    frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
+    slots_B1KD = model.parser(frames_B1).slots_BTKD
+    words = model.text.lookup(["put the red block in the blue bowl", "put the green block in the gray bowl"])
+    predicted_BSKD = Dynamics(model)(slots_B1KD, words, 2)
+    drawn = model.renderer(predicted_BSKD[:, -1]).frames_B3HW
+    (drawn - frames_B1[:, 0].flip(-1)).square().mean().backward()
+
+    def touched(part: torch.nn.Module) -> list[str]:
+        return [name for name, p in part.named_parameters() if p.grad is not None and p.grad.any()]
+
+    assert touched(model.parser) == touched(model.renderer) == []
+    parts = {name.split(".")[0] for name in touched(model.predictor)}
+    assert parts == {"slot_in", "layers", "slot_out", "ages"}
+    assert bool(touched(model.text)) == model.predictor.hears_text
