@@ -42,10 +42,12 @@ from experiments.protocol.runtime_subjects import (
     Scenes,
     Subject,
     Work,
+    mage_subject,
     paper_models,
     planning_query,
     published_form,
     slot_subject,
+    untrained_mage,
     whole_subject,
 )
 from experiments.protocol.scenes import draw, test_scenes
@@ -53,8 +55,10 @@ from experiments.protocol.timing import machine_in_words, other_load, race
 from experiments.protocol.workers import available_cores
 from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgress, package_versions
 from planning import AppearanceGrounder, Instruction, PinholeCamera
+from textocvp.mage.video import MageVideoModel
 from textocvp.world_model import WorldModel
 
+MAGE = "MAGE"
 EVERY_PHASE: tuple[Phase, ...] = ("encode", "predict", "decode", "all")
 
 
@@ -190,8 +194,15 @@ def all_subjects(world_model: WorldModel, scenes: Scenes, paper: bool) -> tuple[
             absent.append(Absent(name, f"it looks at frames of {model.image_size} pixels"))
         elif isinstance(model, WorldModel):
             subjects.append(slot_subject(name, notes[name], model, scenes, EVERY_PHASE))
+        elif isinstance(model, MageVideoModel):
+            subjects.append(mage_subject(name, notes[name], model, scenes))
         else:
             subjects.append(whole_subject(name, notes[name], model, scenes))
+    if MAGE in {one.method for one in absent}:
+        # How long it takes does not depend on what it has learned.
+        note = f"{notes[MAGE]}, preset mage-small; {UNTRAINED}"
+        subjects.append(mage_subject(MAGE, note, untrained_mage(), scenes))
+        absent = [one for one in absent if one.method != MAGE]
     if paper:
         window, cache = paper_models()
         note = f"8 layers of 512, 8 slots of 128; {UNTRAINED}"

@@ -14,6 +14,9 @@ from planning.planners import watched_frames
 from planning.scores import CarryScore, PlacementScore
 from planning.thresholds import THRESHOLDS
 from textocvp.config import ModelConfig, preset
+from textocvp.mage.config import mage_preset
+from textocvp.mage.model import Mage
+from textocvp.mage.video import MageVideoModel
 from textocvp.model import TextOCVP
 from textocvp.rollout import Rollout
 from textocvp.video import VideoModel
@@ -103,6 +106,41 @@ def slot_subject(
         return lambda: Rollout(slots_BTKD, tuple(texts), world_model.image_size, layout, renderer).frames
 
     return Subject(name, note, work)
+
+
+def mage_subject(name: str, note: str, video: MageVideoModel, scenes: Scenes) -> Subject:
+    """MAGE in the same phases: frames to codes, sentences and codes to the codes to come, codes to frames."""
+    model, longest = video.model, video.longest_horizon
+
+    def work(cell: Cell) -> Work | None:
+        if cell.frames > longest:
+            return None
+        images, texts = scenes.images_BHW3[: cell.batch], list(scenes.texts[: cell.batch])
+        if cell.phase == "all":
+            return lambda: video.imagine(images, texts, horizon=cell.frames)
+        frames_B3HW = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1
+        with torch.no_grad():
+            seen_B1hw = model.vqvae.encode(frames_B3HW)[:, None]
+        # Codes of the observation will do: which codes they are does not change what drawing them costs.
+        codes_Nhw = seen_B1hw.expand(-1, cell.frames, -1, -1).flatten(0, 1)
+
+        @torch.no_grad()
+        def phase() -> object:
+            if cell.phase == "encode":
+                return model.vqvae.encode(frames_B3HW)
+            if cell.phase == "decode":
+                return model.vqvae.decode(codes_Nhw)
+            return model.axial.imagine(seen_B1hw, model.text(texts), cell.frames)
+
+        return phase
+
+    return Subject(name, note, work)
+
+
+def untrained_mage() -> MageVideoModel:
+    """MAGE at the small preset's sizes with random weights."""
+    torch.manual_seed(0)
+    return MageVideoModel(Mage(mage_preset("mage-small")))
 
 
 def whole_subject(name: str, note: str, model: VideoModel, scenes: Scenes) -> Subject:

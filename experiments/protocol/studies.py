@@ -36,6 +36,8 @@ class Study:
 
 
 _FRAMES = tuple(("test", f"{length} frames") for length in (9, 19, 24))
+_MEANS = tuple(("test", f"frames 1-{length}") for length in (9, 19, 24))
+_SPLITS = ("test", "unseen_colors", "more_objects")
 _LONG = (
     ("test", "one step"),
     ("two_steps", "two steps"),
@@ -79,6 +81,17 @@ STUDIES = (
             "lpips_drop_unseen_colors",
             "lpips_drop_more_objects",
         ),
+        picks=(
+            Pick("carried out", "closed_loop_success", tuple((split, "whole episode") for split in _SPLITS)),
+            Pick("SSIM", "ssim", tuple((split, "9 frames") for split in _SPLITS), digits=3),
+            Pick("LPIPS, relative drop", "lpips_drop", tuple((s, "9 frames") for s in _SPLITS[1:]), digits=3),
+            Pick(
+                "ST-LPIPS, relative drop",
+                "st_lpips_drop",
+                tuple((s, "9 frames") for s in _SPLITS[1:]),
+                digits=3,
+            ),
+        ),
     ),
     Study(
         "prediction",
@@ -97,6 +110,12 @@ STUDIES = (
         "Objects",
         "Do imagined masks stay on their objects?",
         reads="baselines",
+        first=("iou_9", "iou_copy_seed_9", "iou_true_frames_9", "iou_moving_9", "ari_9"),
+        picks=(
+            Pick("mask IoU", "iou", _MEANS, digits=3),
+            Pick("mask IoU, what moves", "iou_moving", _MEANS, digits=3),
+            Pick("foreground ARI", "foreground_ari", _MEANS, digits=3),
+        ),
     ),
     Study(
         "ablations",

@@ -110,6 +110,7 @@ def test_a_whole_study(tmp_path: Path) -> None:
     for phase in ("predict", "decode", "all"):
         for frames in (1, 2):
             assert (OURS, "1 thread", f"{phase}, {frames} x 2") in found
+            assert ("MAGE", "1 thread", f"{phase}, {frames} x 2") in found
     assert (WINDOW, "1 thread", "decode, 1 x 1") not in found
     page = (tmp_path / "report.html").read_text()
     assert "untrained, timing only" in page and "Quick run." in page
