@@ -95,8 +95,7 @@ class ClusterInitializer(nn.Module):
         Raises:
             ValueError: if `num_slots` is below 2.
         """
-        if num_slots < 2:
-            raise ValueError(f"num_slots must be at least 2 (a background and one region), not {num_slots}")
+        check_slots(num_slots)
         B, _, H, W = frames.shape
         colors_BNC = color_features(frames.flatten(2).transpose(1, 2).float())
         place_BNC = (PLACE_WEIGHT * pixel_grid(H, W, device=frames.device).flatten(0, 1)).expand(B, -1, -1)
@@ -171,3 +170,56 @@ class ClusterInitializer(nn.Module):
         background_B1N = 1 - regions_BSN.sum(1, keepdim=True)
         masks_BKN = torch.cat([background_B1N, regions_BSN], dim=1)
         return Clusters(masks_BKN.view(B, num_slots, H, W), (masks_BKN.sum(-1) > 0).to(masks_BKN.dtype))
+
+
+class FeatureClusters(ClusterInitializer):
+    """The same on the features of a frozen image encoder, which tell things apart without regard to their colour.
+
+    Features are compared by their direction (each is normalised to mean 0 and length 1), and their distances from the
+    image's median feature, the background, are scaled so that the largest is 1. Clusters are not united: what makes two
+    of them one thing is known for colours only.
+
+    Args:
+        seeds: how many clusters to start from, the background not counted.
+        rounds: k-means rounds.
+        background_distance: share of the largest squared distance from the background above which a location can seed.
+        place_weight: length of the image's half side, in units of the largest distance.
+    """
+
+    def __init__(
+        self, seeds: int = 12, rounds: int = 4, background_distance: float = 0.3, place_weight: float = 0.3
+    ) -> None:
+        super().__init__(seeds, rounds, background_distance, min_pixels=1)
+        self.place_weight = place_weight
+
+    @torch.no_grad()
+    def forward(self, features: Tensor, num_slots: int) -> Clusters:
+        """Divide each image's locations into a background and at most `num_slots - 1` regions.
+
+        Args:
+            features: (B, F, h, w).
+            num_slots: K, background included, at least 2.
+
+        Raises:
+            ValueError: if `num_slots` is below 2.
+        """
+        check_slots(num_slots)
+        B, C, H, W = features.shape
+        points_BNC = F.layer_norm(features.flatten(2).transpose(1, 2).float(), (C,)) * C**-0.5
+        points_BNC = points_BNC - points_BNC.median(dim=1, keepdim=True).values
+        to_background_BN = points_BNC.square().sum(-1)
+        largest_B1 = to_background_BN.amax(dim=1, keepdim=True).clamp_min(1e-6)
+        to_background_BN = to_background_BN / largest_B1
+        place_N2 = self.place_weight * pixel_grid(H, W, device=features.device).flatten(0, 1)
+        points_BNC = torch.cat(
+            [points_BNC / largest_B1[..., None].sqrt(), place_N2.expand(B, -1, -1)], dim=-1
+        )
+        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots)
+        onehot_BNS = self._k_means(points_BNC, to_background_BN, centers_BSC, used_BS)
+        return self._largest(onehot_BNS.transpose(1, 2), num_slots, H, W)
+
+
+def check_slots(num_slots: int) -> None:
+    """Raise a ValueError if there are too few slots for a background and a region."""
+    if num_slots < 2:
+        raise ValueError(f"num_slots must be at least 2 (a background and one region), not {num_slots}")

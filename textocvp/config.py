@@ -25,9 +25,14 @@ class ParserConfig:
         image_size: side of the square frame in pixels.
         num_slots: K, background included. Can be raised when the model is used.
         layout: what the numbers of a slot mean.
-        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from colour clusters.
+        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour
+            and place, or of the frozen encoder's features.
+        encoder: `conv` (learned) or `dinov2` (frozen; `slot_attention` only).
         encoder_channels: width of the convolutional encoder.
         encoder_stride: stride of its first convolution.
+        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
+        encoder_dim, encoder_patch: width of its features and side of its patches in pixels.
+        encoder_fingerprint: of its weights, set when a model that has used them is saved; others are then an error.
         iterations_first, iterations_next: corrector iterations on the first and on later frames.
         corrector: `slot_attention` (published), `placed` (invariant slot attention with explicit colour, place
             and size; needs `layout.explicit`) or `holistic` (no slots: one vector a frame, for Non-OC).
@@ -42,8 +47,13 @@ class ParserConfig:
     num_slots: int = 12
     layout: SlotLayout = SlotLayout(content=64)
     initializer: Literal["gaussian", "cluster"] = "cluster"
+    encoder: Literal["conv", "dinov2"] = "conv"
     encoder_channels: int = 32
     encoder_stride: int = 1
+    encoder_weights: str = ""
+    encoder_dim: int = 768
+    encoder_patch: int = 14
+    encoder_fingerprint: str = ""
     iterations_first: int = 1
     iterations_next: int = 1
     corrector: Literal["slot_attention", "placed", "holistic"] = "placed"
@@ -62,18 +72,23 @@ class RendererConfig:
     Attributes:
         kind: `broadcast` (spatial broadcast decoder, published), `glimpse` (a small canonical picture a slot,
             placed at the slot's position and scale over a background canvas; needs `layout.explicit`), `patches`
-            (an MLP draws patch by patch) or `upsample` (one slot is the whole frame, for Non-OC).
+            (an MLP draws patch by patch), `features` (the MLP reconstructs the features of a frozen encoder, and a
+            convolutional decoder draws those; needs `parser.encoder` `dinov2`) or `upsample` (one slot is the whole
+            frame, for Non-OC).
         channels: width of the decoder's convolutions (`broadcast` and `upsample` only).
-        hidden: width of the decoder's fully connected layers (`glimpse` and `patches` only).
+        hidden: width of the decoder's fully connected layers (`glimpse`, `patches` and `features` only).
         glimpse_size: side of the canonical picture in cells (`glimpse` only).
         glimpse_extent: how many standard deviations the glimpse reaches to each side (`glimpse` only).
-        patches: patches along a side of the frame (`patches` only).
-        layers: linear layers of the MLP (`patches` only).
+        patches: patches along a side of the frame (`patches` and `features` only).
+        layers: linear layers of the MLP (`patches` and `features` only).
         mask_prior: add a Gaussian at the place and of the size that a linear layer reads off the slot to the logits
-            of its mask (`patches` only).
+            of its mask (`patches` and `features` only).
+        feature_dim: width of the reconstructed features, `parser.encoder_dim` (`features` only).
+        image_decoder: from features to pixels: `cnn` (published) or `vqgan` (larger and sharper) (`features` only).
+        image_channels: width of the first convolution of `cnn`; that of `vqgan` is half of it (`features` only).
     """
 
-    kind: Literal["broadcast", "glimpse", "patches", "upsample"] = "glimpse"
+    kind: Literal["broadcast", "glimpse", "patches", "features", "upsample"] = "glimpse"
     channels: int = 32
     hidden: int = 256
     glimpse_size: int = 24
@@ -81,6 +96,9 @@ class RendererConfig:
     patches: int = 16
     layers: int = 4
     mask_prior: bool = False
+    feature_dim: int = 768
+    image_decoder: Literal["cnn", "vqgan"] = "cnn"
+    image_channels: int = 1024
 
 
 @dataclass(frozen=True)
@@ -302,6 +320,23 @@ PRESETS: dict[str, ModelConfig] = {
         text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
     ),
 }
+
+# The paper's TextOCVP-DINO at its own sizes (CLIPort, 336x336: 24x24 patches).
+PRESETS["cliport-dino"] = ModelConfig(
+    name="cliport-dino",
+    parser=ParserConfig(
+        image_size=336,
+        num_slots=10,
+        layout=SlotLayout(content=128, explicit=False),
+        initializer="gaussian",
+        encoder="dinov2",
+        iterations_first=3,
+        corrector="slot_attention",
+        transition_hidden=512,
+    ),
+    renderer=RendererConfig(kind="features", hidden=1024, patches=24),
+    text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
+)
 
 # OCVP-Seq, the predictor without text: beside the shipped model, and at its published size beside TextOCVP-SAVi.
 PRESETS["ocvp-seq-small"] = replace(

@@ -162,6 +162,10 @@ class EpisodeFile:
         Raises:
             ValueError: when no episode is that long.
         """
+        return self.clips(self.random_starts(rng, count, length)[rows], length)
+
+    def random_starts(self, rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
+        """Where random clips start: their first frames' numbers (count,) in the file; as `random_clips`."""
         if count < 1 or length < 1:
             raise ValueError(f"count and length must be at least 1, not {count} and {length}")
         # An episode of T frames has T - length + 1 clips.
@@ -169,11 +173,14 @@ class EpisodeFile:
         if len(self) == 0 or ends[-1] == 0:
             longest = int(self.lengths.max(initial=0))
             raise ValueError(f"no episode has {length} frames; the longest of {self.path} has {longest}")
-        picks = rng.integers(ends[-1], size=count)[rows]
+        picks = rng.integers(ends[-1], size=count)
         episodes = np.searchsorted(ends, picks, side="right")
         offsets = picks - (ends[episodes] - np.maximum(self.lengths[episodes] - length + 1, 0))
-        starts = self._starts[episodes] + offsets
-        clips = np.empty((len(picks), length, self.image_size, self.image_size, 3), dtype=np.uint8)
+        return self._starts[episodes] + offsets
+
+    def clips(self, starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
+        """Clips (len(starts), length, H, W, 3) that start at these frames of the file."""
+        clips = np.empty((len(starts), length, self.image_size, self.image_size, 3), dtype=np.uint8)
         dataset = self._open()["frames"]
         # In the file's order, so that clips of one chunk are read while it is cached.
         for place in np.argsort(starts):

@@ -22,15 +22,19 @@ class ParserLoss:
         mask: cross-entropy of the drawn masks against the parser's attention.
         place: squared error of the places that the transition expected against those the corrector found; for slots
             without explicit places, of those that the renderer reads off them against those of their attention.
+        feature: mean squared error of the reconstructed features, for renderers that have any.
     """
 
     image: Tensor
     mask: Tensor
     place: Tensor
+    feature: Tensor
 
-    def total(self, mask_weight: float, place_weight: float) -> Tensor:
+    def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
-        return self.image + mask_weight * self.mask + place_weight * self.place
+        return (
+            self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
+        )
 
     def figures(self) -> dict[str, Tensor]:
         """The terms, named for a log."""

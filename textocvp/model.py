@@ -1,9 +1,10 @@
 """TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
 
 A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the
-model, and no other). A frozen pretrained text encoder is not in it: `config.json` has its name and
-fingerprint. Of a fine-tuned one the folder `text` holds architecture and tokenizer. Loading is strict: a
-checkpoint that does not fit is an error that names the field or the tensor. Nothing is ever unpickled.
+model, and no other). Frozen pretrained encoders, of text and of images, are not in it: `config.json` has
+their names and fingerprints. Of a fine-tuned one the folder `text` holds architecture and tokenizer. Loading
+is strict: a checkpoint that does not fit is an error that names the field or the tensor. Nothing is ever
+unpickled.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from textocvp.config import ModelConfig
+from textocvp.feature_renderer import check_features
 from textocvp.parser import build_parser
 from textocvp.predictor import build_predictor
 from textocvp.renderer import build_renderer
@@ -58,6 +60,7 @@ class TextOCVP(
 
     def __init__(self, config: ModelConfig, text_files: Path | None = None) -> None:
         super().__init__()
+        check_features(config)
         self.parser = build_parser(config.parser)
         self.text = build_text_encoder(config.text, text_files)
         if config.predictor.color_bias and not self.text.words_have_rgb:
@@ -82,7 +85,8 @@ class TextOCVP(
         }
         save_file(tensors, save_directory / WEIGHTS_FILE, metadata={"format": "pt"})
         self.text.save_files(save_directory / TEXT_FOLDER)
-        text = json.dumps(self.config.to_dict(), indent=2) + "\n"
+        parser = replace(self.config.parser, encoder_fingerprint=self.parser.encoder_fingerprint)
+        text = json.dumps(replace(self.config, parser=parser).to_dict(), indent=2) + "\n"
         (save_directory / CONFIG_FILE).write_text(text, encoding="utf-8")
 
     @classmethod

@@ -28,11 +28,14 @@ class Parsed:
         attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
         expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None
             for a parser whose slots have no place that could be expected.
+        features_BTLF: what a frozen encoder saw, of L patches row by row: what reconstructed features are compared
+            with; None for a parser that learns its encoder.
     """
 
     slots_BTKD: Tensor
     attention_BTKHW: Tensor
     expected_BTKD: Tensor | None = None
+    features_BTLF: Tensor | None = None
 
 
 class SceneParser(nn.Module):
@@ -43,6 +46,11 @@ class SceneParser(nn.Module):
     """
 
     layout: SlotLayout
+
+    @property
+    def encoder_fingerprint(self) -> str:
+        """Of the weights of a frozen encoder that is no part of the checkpoint; empty where there is none."""
+        return ""
 
     @abstractmethod
     def forward(
@@ -75,6 +83,10 @@ def build_parser(config: ParserConfig) -> SceneParser:
     Raises:
         ValueError: if there is no such corrector, or it does not fit the layout.
     """
+    if config.encoder != "conv" and config.corrector != "slot_attention":
+        raise ValueError(
+            f"parser.encoder {config.encoder!r} needs parser.corrector=slot_attention, not {config.corrector!r}"
+        )
     # Imported here because the parsers import this module for their base class.
     if config.corrector == "slot_attention":
         from textocvp.savi import SaviParser

@@ -61,8 +61,14 @@ class PatchDecoder(nn.Module):
             inner += [nn.Linear(hidden, hidden), nn.ReLU()]
         self.rest = nn.Sequential(*inner, nn.Linear(hidden, out_dim))
 
-    def forward(self, slots_BKD: Tensor) -> Tensor:
-        return self.rest(self.slot(slots_BKD)[:, :, None] + self.place(self.codes_LC))
+    def forward(self, slots_BKD: Tensor, first: int | None = None) -> Tensor:
+        """All `out_dim` numbers of every place, or only the first so many."""
+        *inner, last = self.rest
+        hidden_BKLH = self.slot(slots_BKD)[:, :, None] + self.place(self.codes_LC)
+        for layer in inner:
+            hidden_BKLH = layer(hidden_BKLH)
+        assert isinstance(last, nn.Linear)
+        return F.linear(hidden_BKLH, last.weight[:first], last.bias[:first])
 
 
 class SlotPlace(nn.Module):

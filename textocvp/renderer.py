@@ -20,15 +20,21 @@ class Rendered:
         frames_B3HW: the composed frame, -1..1 (a renderer may overshoot slightly; `Rollout` clamps).
         masks_BKHW: each slot's share of each pixel; sums to 1 over the slots.
         draw_objects: makes `object_frames_BK3HW`.
+        features_BLF: the image features that the frame was drawn from, of L patches row by row; None for renderers
+            that draw pixels from slots.
     """
 
     frames_B3HW: Tensor
     masks_BKHW: Tensor
     draw_objects: Callable[[], Tensor]
+    features_BLF: Tensor | None = None
 
     @property
     def object_frames_BK3HW(self) -> Tensor:
-        """Each slot drawn alone; the frame is their mask-weighted sum. Made when asked for, being K frames large."""
+        """Each slot drawn alone, made when asked for, being K frames large.
+
+        The frame is their mask-weighted sum; with features, it is drawn from the mask-weighted sum of theirs.
+        """
         return self.draw_objects()
 
 
@@ -77,8 +83,14 @@ def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) 
         from textocvp.patches import PatchRenderer
 
         return PatchRenderer(config, layout, image_size)
+    if config.kind == "features":
+        from textocvp.feature_renderer import FeatureRenderer
+
+        return FeatureRenderer(config, layout, image_size)
     if config.kind == "upsample":
         from textocvp.upsample import UpsampleRenderer
 
         return UpsampleRenderer(config, layout, image_size)
-    raise ValueError(f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse, patches, upsample")
+    raise ValueError(
+        f"unknown renderer.kind {config.kind!r}; known: broadcast, glimpse, patches, features, upsample"
+    )

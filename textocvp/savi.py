@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.clustering import ClusterInitializer
+from textocvp.clustering import ClusterInitializer, FeatureClusters
 from textocvp.config import ParserConfig
+from textocvp.dino import DINO_HUB_ID, DinoEncoder
+from textocvp.initializers import ClusterSlots, GaussianInitializer
 from textocvp.parser import Parsed, SceneParser
 from textocvp.slots import pixel_grid
 
@@ -58,7 +59,7 @@ class ConvEncoder(nn.Module):
             if isinstance(module, nn.Conv2d):
                 # PyTorch's own initialisation shrinks the picture layer by layer, until the position code drowns it.
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
             nn.LayerNorm(channels), nn.Linear(channels, out_dim), nn.ReLU(), nn.Linear(out_dim, out_dim)
@@ -69,62 +70,23 @@ class ConvEncoder(nn.Module):
         return self.mlp(features_NCHW.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-class GaussianInitializer(nn.Module):
-    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test
-    time."""
+class FeatureProjection(nn.Module):
+    """Features of a frozen encoder (N, F, h, w) to those that slots compete for (N, D, h, w): a location-wise MLP.
 
-    def __init__(self, slot_dim: int) -> None:
-        super().__init__()
-        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
-        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
-
-    def forward(
-        self,
-        batch: int,
-        num_slots: int,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Tensor:
-        """(batch, num_slots, D) slots."""
-        if isinstance(generator, Sequence):
-            noise_KD = [
-                torch.randn(num_slots, self.mean.shape[0], generator=g, device=g.device) for g in generator
-            ]
-            return self.mean + self.log_deviation.exp() * torch.stack(noise_KD).to(self.mean)
-        noise_BKD = torch.randn(
-            batch,
-            num_slots,
-            self.mean.shape[0],
-            generator=generator,
-            device=self.mean.device,
-            dtype=self.mean.dtype,
-        )
-        return self.mean + self.log_deviation.exp() * noise_BKD
-
-
-class ClusterSlots(nn.Module):
-    """First slots from clusters of colour and place: the mean feature of each cluster, through a small MLP.
-
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
-    family a slot has no presence that could switch it off.
+    They know their places already, so there is no position code.
     """
 
-    def __init__(self, slot_dim: int) -> None:
+    def __init__(self, feature_dim: int, out_dim: int) -> None:
         super().__init__()
-        self.clusters = ClusterInitializer()
         self.mlp = nn.Sequential(
-            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
+            nn.LayerNorm(feature_dim),
+            nn.Linear(feature_dim, feature_dim),
+            nn.ReLU(),
+            nn.Linear(feature_dim, out_dim),
         )
-        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
 
-    def forward(self, frames_B3HW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
-        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers."""
-        found = self.clusters(frames_B3HW, num_slots)
-        shares_BKL = F.adaptive_avg_pool2d(
-            found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
-        ).flatten(2)
-        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
-        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
-        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL
+    def forward(self, features_NFhw: Tensor) -> Tensor:
+        return self.mlp(features_NFhw.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class SlotAttention(nn.Module):
@@ -195,11 +157,27 @@ class SaviParser(SceneParser):
             raise ValueError("parser.corrector 'slot_attention' needs parser.layout.explicit = false")
         if config.initializer not in ("gaussian", "cluster"):
             raise ValueError(f"unknown parser.initializer {config.initializer!r}; known: gaussian, cluster")
+        if config.encoder not in ("conv", "dinov2"):
+            raise ValueError(f"unknown parser.encoder {config.encoder!r}; known: conv, dinov2")
         self.config = config
         self.layout = config.layout
         dim = config.layout.dim
-        self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
-        self.initializer = GaussianInitializer(dim) if config.initializer == "gaussian" else ClusterSlots(dim)
+        self.dino: DinoEncoder | None = None
+        if config.encoder == "dinov2":
+            self.dino = DinoEncoder(
+                config.encoder_weights or DINO_HUB_ID,
+                dim=config.encoder_dim,
+                patch=config.encoder_patch,
+                fingerprint=config.encoder_fingerprint,
+            )
+            self.cells = self.dino.cells(config.image_size)
+            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(config.encoder_dim, dim)
+        else:
+            self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
+        if config.initializer == "gaussian":
+            self.initializer: GaussianInitializer | ClusterSlots = GaussianInitializer(dim)
+        else:
+            self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
         self.transition = nn.TransformerEncoderLayer(
@@ -211,16 +189,37 @@ class SaviParser(SceneParser):
             norm_first=True,
         )
 
+    @property
+    def encoder_fingerprint(self) -> str:
+        return self.dino.fingerprint if self.dino else ""
+
     def forward(
         self,
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        features_BTLF: Tensor | None = None,
     ) -> Parsed:
+        """Parse clips; see `SceneParser.forward`.
+
+        Args:
+            features_BTLF: of the frozen encoder, where they are known already; its weights are then not needed.
+
+        Raises:
+            ValueError: if features are given to a parser that learns its encoder.
+        """
         B, T = frames_BT3HW.shape[:2]
         K = self.config.num_slots if num_slots is None else num_slots
-        features_NDhw = self.encoder(frames_BT3HW.flatten(0, 1))
+        if self.dino is None:
+            if features_BTLF is not None:
+                raise ValueError("features are for a parser with a frozen encoder: parser.encoder is 'conv'")
+            seen_BTCHW = frames_BT3HW
+        else:
+            if features_BTLF is None:
+                features_BTLF = self.dino(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
+            seen_BTCHW = features_BTLF.transpose(2, 3).unflatten(3, (self.cells, self.cells))
+        features_NDhw = self.encoder(seen_BTCHW.flatten(0, 1))
         h, w = features_NDhw.shape[-2:]
         features_BTLD = features_NDhw.flatten(2).transpose(1, 2).unflatten(0, (B, T))
 
@@ -229,7 +228,7 @@ class SaviParser(SceneParser):
             guess_BKD = self.initializer(B, K, generator)
         else:
             first_BDhw = features_NDhw.unflatten(0, (B, T))[:, 0]
-            guess_BKD, clusters_BKL = self.initializer(frames_BT3HW[:, 0], first_BDhw, K)
+            guess_BKD, clusters_BKL = self.initializer(seen_BTCHW[:, 0], first_BDhw, K)
         slots, attention = [], []
         for t in range(T):
             rounds = self.config.iterations_first if t == 0 else self.config.iterations_next
@@ -239,4 +238,4 @@ class SaviParser(SceneParser):
             attention.append(attention_BKL.unflatten(2, (h, w)))
             if t + 1 < T:
                 guess_BKD = self.transition(slots_BKD)
-        return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1))
+        return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1), features_BTLF=features_BTLF)

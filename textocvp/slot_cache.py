@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from textocvp.config import ParserConfig
 from textocvp.parser import to_frames
 
 if TYPE_CHECKING:
@@ -98,9 +99,25 @@ class SlotCache:
             raise SlotCacheError(f"{path} is no slot cache, or damaged: {error}") from error
 
 
+LATER_FIELDS = (
+    "pool_cells",
+    "encoder",
+    "encoder_dim",
+    "encoder_patch",
+    "encoder_fingerprint",
+)
+"""Fields of `ParserConfig` that came after the first caches: they count only where they are not at their default."""
+
+
 def parser_fingerprint(model: TextOCVP) -> str:
-    """A hash of the parser's configuration and weights."""
-    digest = hashlib.sha256(json.dumps(model.config.to_dict()["parser"], sort_keys=True).encode())
+    """A hash of the parser's configuration and weights; of a frozen encoder's weights, their fingerprint."""
+    defaults, settings = asdict(ParserConfig()), model.config.to_dict()["parser"]
+    settings = {
+        name: value
+        for name, value in settings.items()
+        if not (name in LATER_FIELDS and value == defaults[name]) and name != "encoder_weights"
+    }
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name, tensor in sorted(model.parser.state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())

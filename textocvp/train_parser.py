@@ -16,19 +16,22 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import torch
+import torch.nn.functional as F
+from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from textocvp.config import preset, with_settings
 from textocvp.drawing import color_masks
 from textocvp.episodes import EpisodeFile
+from textocvp.feature_cache import FeatureCache, encode_share
 from textocvp.loading import read_ahead
 from textocvp.losses import ParserLoss, image_loss, mask_loss, place_loss, read_place_loss, thing_weights
 from textocvp.model import TextOCVP
 from textocvp.parser import to_frames
 from textocvp.parser_quality import ParserQuality, measure_parser
 from textocvp.slots import SlotState
-from textocvp.training import Run, TrainingSettings, finish, start, step_rng
+from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
 
 
 @dataclass(kw_only=True)
@@ -55,6 +58,10 @@ class ParserTraining(TrainingSettings):
     """Weight of the agreement between drawn masks and attention."""
     place_weight: float = 0.1
     """Weight of the transition's error in place, or of the error of the places that the renderer reads."""
+    feature_weight: float = 1.0
+    """Weight of the error of reconstructed features (renderer `features` only)."""
+    cache_features: bool = False
+    """Encode all training episodes once and read their features from disk (parser with a frozen encoder only)."""
 
 
 @dataclass
@@ -64,10 +71,12 @@ class Clips:
     Attributes:
         frames_BTHW3: uint8.
         seeds_B: one for each clip, for parsers that draw their first slots.
+        features_BTLF: of the frozen encoder, float16, where they are cached.
     """
 
     frames_BTHW3: Tensor
     seeds_B: Tensor
+    features_BTLF: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -78,18 +87,25 @@ class ClipReader:
         episodes: the training episodes.
         args: the stage's settings.
         rows: of the step's batch, those to read.
+        features: of the same episodes, if they are cached.
     """
 
     episodes: EpisodeFile
     args: ParserTraining
     rows: slice
+    features: FeatureCache | None = None
 
     def __call__(self, step: int) -> Clips:
         args, rng = self.args, step_rng(self.args.seed, step)
         stride = int(rng.integers(1, args.stride + 1))
-        frames = self.episodes.random_clips(rng, args.batch, (args.clip - 1) * stride + 1, self.rows)
+        length = (args.clip - 1) * stride + 1
+        starts = self.episodes.random_starts(rng, args.batch, length)[self.rows]
+        frames = self.episodes.clips(starts, length)
         seeds_B = rng.integers(2**63, size=args.batch)[self.rows]
-        return Clips(torch.from_numpy(frames[:, ::stride].copy()), torch.from_numpy(seeds_B))
+        clips = Clips(torch.from_numpy(frames[:, ::stride].copy()), torch.from_numpy(seeds_B))
+        if self.features is not None:
+            clips.features_BTLF = torch.from_numpy(self.features.clips(starts, length, stride))
+        return clips
 
 
 class Redrawing(nn.Module):
@@ -112,6 +128,7 @@ def parser_loss(
     whole: Tensor | None = None,
     share: float = 1.0,
     generator: Sequence[torch.Generator] | None = None,
+    features_BTLF: Tensor | None = None,
 ) -> ParserLoss:
     """The terms of stage 1 for clips in -1..1, or what a part of a batch adds to those of the batch.
 
@@ -120,12 +137,14 @@ def parser_loss(
         whole: the sum of those weights over the whole batch; None for clips that are a whole batch.
         share: how much of the batch these clips are.
         generator: for parsers that draw their first slots, one for each clip.
+        features_BTLF: of the parser's frozen encoder, where they are known already.
     """
-    parsed = model.parser(frames_BT3HW, generator=generator)
+    known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
+    parsed = model.parser(frames_BT3HW, generator=generator, **known)
     target = frames_BT3HW.flatten(0, 1)
     slots_NKD, attention_NKHW = parsed.slots_BTKD.flatten(0, 1), parsed.attention_BTKHW.flatten(0, 1)
     rendered = model.renderer(slots_NKD)
-    mask = place = target.new_zeros(())
+    mask = place = feature = target.new_zeros(())
     places = model.renderer.places(slots_NKD)
     if places is not None:
         place = read_place_loss(*places, attention_NKHW)
@@ -134,7 +153,10 @@ def parser_loss(
         mask = mask_loss(rendered, attention_NKHW, weights_N1HW, whole)
         found = SlotState.split(parsed.slots_BTKD[:, 1:], layout)
         place = place_loss(SlotState.split(parsed.expected_BTKD, layout), found)
-    return ParserLoss(image_loss(rendered, target, weights_N1HW, whole), mask, share * place)
+    if rendered.features_BLF is not None and parsed.features_BTLF is not None:
+        feature = F.mse_loss(rendered.features_BLF, parsed.features_BTLF.flatten(0, 1))
+    image = image_loss(rendered, target, weights_N1HW, whole)
+    return ParserLoss(image, mask, share * place, share * feature)
 
 
 def train(args: ParserTraining) -> ParserQuality | None:
@@ -144,6 +166,8 @@ def train(args: ParserTraining) -> ParserQuality | None:
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
+        DinoWeightsError: if the weights of the parser's frozen encoder are missing.
+        FeatureCacheError: if `out` holds features of another encoder or of other episodes.
     """
     accelerator = start(
         args.out, args.precision, some_unused=args.clip == 1
@@ -152,10 +176,16 @@ def train(args: ParserTraining) -> ParserQuality | None:
     model = TextOCVP(with_settings(preset(args.preset), args.set)).to(accelerator.device)
     run, quality = Run(args, accelerator, Redrawing(model)), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        features = None
+        if args.cache_features:
+            features = _all_features(model, episodes, args.out / "features-train", accelerator)
         left = range(run.first, args.steps)
-        batches = read_ahead(ClipReader(episodes, args, run.rows), left, args.workers)
+        batches = read_ahead(ClipReader(episodes, args, run.rows, features), left, args.workers)
         for step, clips in zip(run.steps("parser"), batches, strict=True):
             frames_BT3HW = to_frames(clips.frames_BTHW3, run.device)
+            features_BTLF = clips.features_BTLF
+            if features_BTLF is not None:
+                features_BTLF = features_BTLF.to(run.device).float()
             weights_BT1HW = thing_weights(frames_BT3HW, args.thing_weight)
             whole = run.total(weights_BT1HW.sum())
             for part in run.parts():
@@ -166,8 +196,10 @@ def train(args: ParserTraining) -> ParserQuality | None:
                     whole=whole,
                     share=run.share(part),
                     generator=generators,
+                    features_BTLF=None if features_BTLF is None else features_BTLF[part],
                 )
-                run.backward(loss.total(args.mask_weight, args.place_weight), loss.figures())
+                total = loss.total(args.mask_weight, args.place_weight, args.feature_weight)
+                run.backward(total, loss.figures())
             run.update(step)
 
             if run.is_main and (step + 1) % args.evaluate_every == 0:
@@ -184,6 +216,18 @@ def train(args: ParserTraining) -> ParserQuality | None:
             (args.out / "quality.json").write_text(quality.to_json())
     finish(accelerator)
     return quality
+
+
+def _all_features(
+    model: TextOCVP, episodes: EpisodeFile, folder: Path, accelerator: Accelerator
+) -> FeatureCache:
+    dino = getattr(model.parser, "dino", None)
+    if dino is None:
+        raise SettingsError("cache_features needs a parser with a frozen encoder: parser.encoder=dinov2")
+    share = (accelerator.process_index, accelerator.num_processes)
+    encode_share(dino, episodes, folder, *share, device=accelerator.device)
+    accelerator.wait_for_everyone()
+    return FeatureCache(dino, episodes, folder)
 
 
 @torch.no_grad()

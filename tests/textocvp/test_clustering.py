@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from textocvp.clustering import ClusterInitializer, color_features
+from textocvp.clustering import ClusterInitializer, FeatureClusters, color_features
 
 RED, BLUE, GRAY, DARK = (255, 87, 89), (78, 121, 167), (186, 176, 172), (47, 47, 47)
 
@@ -79,3 +79,23 @@ def test_shading_moves_color_features_less_than_another_color_does() -> None:
 def test_one_slot_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 2"):
         ClusterInitializer()(paint(), 1)
+
+
+def test_features_of_one_kind_are_one_region_whatever_their_length() -> None:
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(4, 32), dim=-1)
+    labels = torch.zeros(12, 12, dtype=torch.long)
+    labels[1:5, 1:5], labels[6:11, 5:11], labels[1:4, 8:11] = 1, 2, 3
+    features = directions[labels] * (1 + torch.rand(12, 12, 1)) + 0.02 * torch.randn(12, 12, 32)
+    found = FeatureClusters(seeds=3)(features.permute(2, 0, 1)[None], 6)
+    assert found.presence.tolist() == [[1, 1, 1, 1, 0, 0]]
+    by_area = torch.tensor([0, 2, 1, 3])  # the background, then the largest
+    expected = torch.nn.functional.one_hot(labels, 4).permute(2, 0, 1)[by_area].float()
+    assert torch.equal(found.masks[0, :4], expected)
+    with pytest.raises(ValueError, match="at least 2"):
+        FeatureClusters()(torch.zeros(1, 8, 4, 4), 1)
+
+
+def test_features_that_are_all_alike_are_all_background() -> None:
+    found = FeatureClusters()(torch.ones(1, 8, 4, 4), 3)
+    assert found.masks[0, 0].min() == 1 and found.presence.tolist() == [[1, 0, 0]]

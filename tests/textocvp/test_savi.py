@@ -10,10 +10,11 @@ from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
 from textocvp.config import ParserConfig, RendererConfig, preset
+from textocvp.initializers import GaussianInitializer
 from textocvp.model import TextOCVP
 from textocvp.parser import build_parser
 from textocvp.renderer import build_renderer
-from textocvp.savi import GaussianInitializer, SaviParser, SlotAttention
+from textocvp.savi import SaviParser, SlotAttention
 from textocvp.slots import SlotLayout
 
 CONFIG = PUBLISHED.parser
@@ -118,7 +119,7 @@ def test_choices_that_do_not_fit_are_errors_that_say_why() -> None:
         parser(initializer="random")
     with pytest.raises(ValueError, match="slot_attention, placed"):
         parser(corrector="none")
-    with pytest.raises(ValueError, match="broadcast, glimpse, patches"):
+    with pytest.raises(ValueError, match="broadcast, glimpse, patches, features, upsample"):
         build_renderer(RendererConfig(kind="none"), SlotLayout(8), 32)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 1 iteration"):
         parser(iterations_first=0)(frames())

@@ -92,12 +92,12 @@ def test_training_lowers_the_loss_and_leaves_the_second_stage_alone(run):
 def test_only_the_first_episodes_are_used_if_so_asked(run, monkeypatch):
     seen = []
 
-    def spy(self, rng, count, length, rows):
+    def spy(self, rng, count, length):
         seen.append(len(self))
-        return original(self, rng, count, length, rows)
+        return original(self, rng, count, length)
 
-    original = EpisodeFile.random_clips
-    monkeypatch.setattr(EpisodeFile, "random_clips", spy)
+    original = EpisodeFile.random_starts
+    monkeypatch.setattr(EpisodeFile, "random_starts", spy)
     train(run("out", steps=1, episodes=2))
     assert seen == [2]
 
