@@ -1,4 +1,4 @@
-"""The command line: `textocvp train parser|predictor`, `textocvp rollout`, `textocvp info`."""
+"""The command line: `textocvp train`, `textocvp rollout`, `textocvp models`, `textocvp info`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.config import PRESETS, preset, with_settings
+from textocvp.config import preset, with_settings
 from textocvp.drawing import SUFFIXES
-from textocvp.model import CONFIG_FILE, CheckpointError, TextOCVP
-from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel, bundled_checkpoints
+from textocvp.model import CONFIG_FILE, CheckpointError
+from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel
 
 
 class Mistake(Exception):
@@ -63,11 +63,13 @@ class RolloutCommand:
 
 
 @dataclass
-class InfoCommand:
-    """Say what a checkpoint is: its parts, their sizes and every setting.
+class ModelsCommand:
+    """List every model: what it is, how many parameters it has, and where its weights come from."""
 
-    Without a name: the checkpoints that come with the package, and the presets that can be trained.
-    """
+
+@dataclass
+class InfoCommand:
+    """Say what a checkpoint is: its parts, their sizes and every setting. Without a name: as `textocvp models`."""
 
     checkpoint: tyro.conf.Positional[str | None] = None
     """A bundled name, a folder, or a Hugging Face hub id owner/name."""
@@ -76,6 +78,7 @@ class InfoCommand:
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
+    Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
 ]
 
@@ -108,6 +111,8 @@ def _run(arguments: list[str]) -> None:
     )
     if isinstance(command, RolloutCommand):
         _rollout(command)
+    elif isinstance(command, ModelsCommand):
+        _models()
     else:
         _info(command)
 
@@ -120,10 +125,13 @@ def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load and that the other commands
     # never use.
     from textocvp import train_parser, train_predictor
+    from textocvp.dino import DinoWeightsError
     from textocvp.episodes import EpisodeFile
+    from textocvp.feature_cache import FeatureCacheError
     from textocvp.mage import train_mage, train_vqvae
     from textocvp.mage.config import mage_preset
     from textocvp.slot_cache import SlotCacheError
+    from textocvp.text_weights import TextWeightsError
     from textocvp.training import SettingsError
 
     Stage = Union[  # noqa: UP007
@@ -159,7 +167,13 @@ def _train(arguments: list[str]) -> None:
     }
     try:
         train[type(chosen)](chosen)
-    except (SettingsError, SlotCacheError) as error:
+    except (
+        SettingsError,
+        SlotCacheError,
+        FeatureCacheError,
+        DinoWeightsError,
+        TextWeightsError,
+    ) as error:
         raise Mistake(str(error)) from error
 
 
@@ -195,10 +209,10 @@ def _rollout(command: RolloutCommand) -> None:
 
 
 def _info(command: InfoCommand) -> None:
-    console = Console()
     if command.checkpoint is None:
-        _list(console)
+        _models()
         return
+    console = Console()
     world_model = WorldModel.from_pretrained(command.checkpoint)
     model = world_model.model
     console.print(f"[bold]{world_model.checkpoint.name}[/bold]  {world_model!r}", highlight=False)
@@ -214,24 +228,19 @@ def _info(command: InfoCommand) -> None:
     console.print(_tree(CONFIG_FILE, model.config.to_dict()))
 
 
-def _list(console: Console) -> None:
-    bundled = bundled_checkpoints()
-    console.print(f"Checkpoints in this package: {', '.join(bundled) or 'none'}", highlight=False)
-    table = Table("preset", "parser", "renderer", "text", "predictor", "parameters", title="Presets to train")
+def _models() -> None:
+    # Imported here because it brings every architecture with it.
+    from textocvp.catalogue import catalogue
+
+    # On a screen as wide as it is; in a file or a pipe one line a model.
+    console = Console(width=None if sys.stdout.isatty() else 250)
+    table = Table("model", "what it is", "learnable", "predictor", "state", "weights", title="Models")
     table.columns[0].no_wrap = True
-    table.columns[5].justify = "right"
-    for name, config in PRESETS.items():
-        parameters = sum(p.numel() for p in TextOCVP(config).parameters())
-        predictor = config.predictor
-        table.add_row(
-            name,
-            f"{config.parser.corrector}, {config.parser.num_slots} slots of {config.parser.layout.dim}, "
-            f"{config.parser.image_size}x{config.parser.image_size}",
-            config.renderer.kind,
-            config.text.kind,
-            f"{predictor.attention}, {predictor.layers} layers of {predictor.dim}",
-            f"{parameters:,}",
-        )
+    for column in table.columns[2:4]:
+        column.justify, column.no_wrap = "right", True
+    for entry in catalogue():
+        counts = ("-" if count is None else f"{count:,}" for count in (entry.parameters, entry.predictor))
+        table.add_row(entry.name, entry.what, *counts, entry.state, entry.weights)
     console.print(table)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from tests.textocvp.conftest import PLACED, build
 from textocvp import cli
+from textocvp.catalogue import catalogue
 
 TEXT = "put the red block in the blue bowl"
 
@@ -94,10 +95,15 @@ def test_info_describes_a_checkpoint(capsys, checkpoint) -> None:
         assert part in printed
 
 
-def test_info_alone_lists_checkpoints_and_presets(capsys) -> None:
-    assert cli.main(["info"]) == 0
+def test_models_says_of_every_preset_what_it_is(capsys) -> None:
+    assert cli.main(["models"]) == 0
     printed = capsys.readouterr().out
-    assert "tabletop-small" in printed and "savi-cater" in printed
+    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in printed.splitlines()]
+    for entry in catalogue():
+        counts = ["-" if n is None else f"{n:,}" for n in (entry.parameters, entry.predictor)]
+        assert [entry.name, entry.what, *counts, entry.state, entry.weights] in rows
+    assert cli.main(["info"]) == 0
+    assert capsys.readouterr().out == printed
 
 
 def test_info_about_a_damaged_checkpoint_names_the_file(capsys, checkpoint) -> None:
@@ -119,7 +125,7 @@ def test_training_says_what_is_missing_before_it_makes_anything(capsys, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--help"], ["train", "rollout", "info"]),
+        (["--help"], ["train", "rollout", "models", "info"]),
         (["rollout", "--help"], ["put the red block in the blue bowl", "--resize", "--horizon"]),
         (["train", "--help"], ["parser", "predictor", "TensorBoard"]),
         (["train", "parser", "--help"], ["--data", "envs.collect"]),
