@@ -7,7 +7,6 @@ or weights), and what was trained here is what lies in the package.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from typing import Literal
 
 import torch
@@ -15,12 +14,12 @@ from torch import nn
 
 from textocvp.config import PRESETS, ModelConfig
 from textocvp.dino import DINO_HUB_ID
+from textocvp.located import DEFAULT_CHECKPOINT, bundled_checkpoints, located
 from textocvp.mage.config import ARCHITECTURE as MAGE
 from textocvp.mage.config import MAGE_PRESETS, MageConfig
 from textocvp.mage.model import Mage
 from textocvp.model import TextOCVP, read_config, read_json
 from textocvp.text_weights import MINILM_PACKAGE, T5_HUB_ID
-from textocvp.world_model import DEFAULT_CHECKPOINT, bundled_checkpoints
 
 State = Literal["trained here", "not trained here", "needs weights", "figures only"]
 
@@ -131,6 +130,6 @@ def _commands(name: str, config: ModelConfig | MageConfig) -> str:
 
 
 def _bundled_config(name: str) -> ModelConfig | MageConfig:
-    with as_file(files("textocvp") / "checkpoints" / name) as folder:
+    with located(name) as folder:
         data = read_json(folder)
         return MageConfig.from_dict(data) if data.get("architecture") == MAGE else read_config(folder)

@@ -29,7 +29,7 @@ from textocvp.mage.config import mage_preset
 from textocvp.mage.evaluation import Imagined, measure
 from textocvp.mage.model import Mage
 from textocvp.text import WordBatch
-from textocvp.training import Run, SettingsError, TrainingSettings, start, step_rng
+from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
 
 
 @dataclass(kw_only=True)
@@ -117,8 +117,7 @@ def train(args: MageTraining) -> Imagined | None:
             figures = measure(model, held_out, range(len(held_out)))
             print(f"final: {figures}")
             (args.out / "imagined.json").write_text(json.dumps(asdict(figures), indent=2) + "\n")
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
+    finish(accelerator)
     return figures
 
 

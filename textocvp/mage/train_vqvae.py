@@ -28,7 +28,7 @@ from textocvp.mage.config import mage_preset
 from textocvp.mage.vqvae import VQVAE, perplexity
 from textocvp.metrics import psnr
 from textocvp.parser import to_frames
-from textocvp.training import Run, TrainingSettings, start, step_rng
+from textocvp.training import Run, TrainingSettings, finish, start, step_rng
 
 
 @dataclass(kw_only=True)
@@ -172,8 +172,7 @@ def train(args: VQVAETraining) -> Redrawn | None:
             redrawn = measure(model, held_out, range(len(held_out)))
             print(f"final: {redrawn}")
             (args.out / "redrawn.json").write_text(json.dumps(asdict(redrawn), indent=2) + "\n")
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
+    finish(accelerator)
     return redrawn
 
 
