@@ -176,6 +176,12 @@ def train(args: ParserTraining) -> ParserQuality | None:
     model = TextOCVP(with_settings(preset(args.preset), args.set)).to(accelerator.device)
     run, quality = Run(args, accelerator, Redrawing(model)), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        for source in (episodes, held_out):
+            if source.image_size != model.config.parser.image_size:
+                raise SettingsError(
+                    f"{source.path} has frames of {source.image_size} pixels, parser.image_size is "
+                    f"{model.config.parser.image_size}: collect the episodes at that size, or set it"
+                )
         features = None
         if args.cache_features:
             features = _all_features(model, episodes, args.out / "features-train", accelerator)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import train_parser, train_predictor
+from textocvp import cli, train_parser, train_predictor
 from textocvp.config import (
     PRESETS,
     ModelConfig,
@@ -246,7 +246,7 @@ def test_both_stages_and_a_rollout(stage_one: Arguments, weights: Path, tmp_path
 
 
 def test_encoding_goes_on_where_it_was_killed_and_refuses_what_is_not_its_own(
-    stage_one: Arguments, tmp_path: Path
+    stage_one: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = stage_one("out", cache_features=True, steps=1)
     train_parser.train(args)
@@ -271,7 +271,16 @@ def test_encoding_goes_on_where_it_was_killed_and_refuses_what_is_not_its_own(
     with pytest.raises(FeatureCacheError, match="damaged"):
         train_parser.train(dataclasses.replace(args, steps=3))
     with pytest.raises(SettingsError, match="cache_features needs a parser with a frozen encoder"):
-        train_parser.train(stage_one("conv", preset="savi-small", cache_features=True))
+        train_parser.train(
+            stage_one("conv", "parser.image_size=32", preset="savi-small", cache_features=True)
+        )
+    with pytest.raises(SettingsError, match=r"train\.h5 has frames of 32 pixels, parser\.image_size is 64"):
+        train_parser.train(stage_one("other", preset="savi-small"))
+    nowhere = f"parser.encoder_weights={tmp_path / 'nowhere'}"
+    files = ["--data", args.data, "--val", args.val, "--out", tmp_path / "never"]
+    command = ["train", "parser", "--preset", TINY.name, *map(str, files), "--set", nowhere]
+    assert cli.main(command) == 1
+    assert "hf download facebook/dinov2-base" in capsys.readouterr().err
 
 
 def test_choices_that_do_not_fit_are_refused_by_name(weights: Path, tmp_path: Path) -> None:
