@@ -82,8 +82,8 @@ class Sizes:
     threads: tuple[int, ...] = tuple(sorted({1, available_cores()}))
 
 
-QUICK = Sizes(frames=(1, 9), batches=(1, 16), repeats=7, seconds=1.5, longest=1.0)
-DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, longest=6.0)
+QUICK = Sizes(frames=(1, 9), batches=(1, 16), repeats=7, seconds=1.5, longest=4.0)
+DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, longest=20.0)
 
 
 @dataclass
