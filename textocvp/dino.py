@@ -164,7 +164,7 @@ def read_backbone(folder: Path) -> Dinov2Model:
     # Through transformers, which knows under which names its older versions stored the tensors.
     try:
         found: Any = Dinov2Model.from_pretrained(
-            folder, dtype=torch.float32, local_files_only=True, use_safetensors=True, output_loading_info=True
+            folder, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
     # It raises many kinds, one for every way in which a file can be damaged.
     except Exception as error:
@@ -175,4 +175,4 @@ def read_backbone(folder: Path) -> Dinov2Model:
     # It would leave them at random.
     if loading["missing_keys"]:
         raise DinoWeightsError(f"{folder / WEIGHTS_FILE} lacks the tensor {min(loading['missing_keys'])!r}")
-    return backbone
+    return backbone.float()

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from transformers import Dinov2Model
-from transformers.models.bit.image_processing_pil_bit import BitImageProcessorPil
+from transformers import BitImageProcessor, Dinov2Model
 
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from textocvp.dino import IMAGE_MEAN, IMAGE_STD, DinoEncoder, DinoWeightsError, normalized
@@ -32,7 +31,7 @@ def images() -> np.ndarray:
 
 
 def test_frames_are_normalised_as_the_published_image_processor_does(images: np.ndarray) -> None:
-    processor = BitImageProcessorPil(
+    processor = BitImageProcessor(
         do_resize=False, do_center_crop=False, image_mean=list(IMAGE_MEAN), image_std=list(IMAGE_STD)
     )
     wanted = processor(list(images), return_tensors="pt")["pixel_values"]
