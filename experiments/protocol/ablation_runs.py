@@ -22,7 +22,7 @@ Group = Literal["reference", "depth", "residual", "text", "initializer and decod
 
 PREDICTOR_STEPS = 500
 PREDICTOR_BATCH = 32
-PARSER_STEPS = 400
+PARSER_STEPS = 200
 PARSER_BATCH = 16
 PARSER_CLIP = 2
 
