@@ -14,7 +14,6 @@ machines. Writes `results.json`, `report.html` and a plot into `--out`.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -70,7 +69,8 @@ class Sizes:
         frames, batches: of the measurements.
         repeats: rounds of each measurement. seconds: that a measurement may take before it is cut short (to 3 rounds
             at least).
-        longest: what would take longer than this many seconds once is left out.
+        drawn: at the paper's sizes, at most so many frames (of all scenes together) are drawn, as that takes half a
+            second each.
         threads: of PyTorch; by default one, and as many as there are cores.
     """
 
@@ -78,12 +78,12 @@ class Sizes:
     batches: tuple[int, ...]
     repeats: int
     seconds: float
-    longest: float
+    drawn: int
     threads: tuple[int, ...] = tuple(sorted({1, available_cores()}))
 
 
-QUICK = Sizes(frames=(1, 9), batches=(1, 16), repeats=7, seconds=1.5, longest=4.0)
-DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, longest=20.0)
+QUICK = Sizes(frames=(1, 9), batches=(1, 16), repeats=7, seconds=1.5, drawn=1)
+DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, drawn=24)
 
 
 @dataclass
@@ -117,7 +117,7 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
     world_model = WorldModel.from_pretrained(args.checkpoint)
     started, busy = time.monotonic(), other_load()
     scenes = look(args.seed, max(sizes.batches))
-    subjects, absent = all_subjects(world_model, scenes, paper)
+    subjects, absent = all_subjects(world_model, scenes, sizes.drawn if paper else 0)
     threads = sizes.threads
     cells = all_cells(sizes)
     seconds: dict[tuple[str, Cell], np.ndarray] = {}
@@ -126,7 +126,8 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
         with StudyProgress({"phases": (len(cells), 3.0), "planning": (len(threads), 10.0)}) as progress:
             for cell in progress.track("phases", cells):
                 torch.set_num_threads(cell.threads)
-                timed = race(works_of(cell, subjects, seconds, sizes), sizes.repeats, sizes.seconds)
+                works = {one.name: work for one in subjects if (work := one.work(cell)) is not None}
+                timed = race(works, sizes.repeats, sizes.seconds)
                 seconds |= {(name, cell): taken for name, taken in timed.items()}
                 progress.show(phase_table(cell_rows(seconds), cell.threads, cell.batch, sizes.frames))
             queries = {}
@@ -150,7 +151,7 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
         headline=headline(rows, max(threads)),
     )
     notes = {subject.name: subject.note for subject in subjects}
-    report = build_report(results, notes, absent, sizes.longest, busy, args.command("runtime"))
+    report = build_report(results, notes, absent, sizes.drawn, busy, args.command("runtime"))
     with folder.fill() as partial:
         report.write(partial)
     progress.print(phase_table(rows, max(threads), 1, sizes.frames), ratio_table(rows))
@@ -171,8 +172,12 @@ def look(seed: int, count: int) -> Scenes:
     return Scenes(np.stack(images), tuple(texts))
 
 
-def all_subjects(world_model: WorldModel, scenes: Scenes, paper: bool) -> tuple[list[Subject], list[Absent]]:
-    """Everything that is timed, and the baselines that are not there."""
+def all_subjects(world_model: WorldModel, scenes: Scenes, drawn: int) -> tuple[list[Subject], list[Absent]]:
+    """Everything that is timed, and the baselines that are not there.
+
+    Args:
+        drawn: see `Sizes`; with 0 the paper's sizes are left out.
+    """
     subjects = [
         slot_subject(
             OURS, "as it ships: frame-causal, keys and values cached", world_model, scenes, EVERY_PHASE
@@ -203,18 +208,18 @@ def all_subjects(world_model: WorldModel, scenes: Scenes, paper: bool) -> tuple[
         note = f"{notes[MAGE]}, preset mage-small; {UNTRAINED}"
         subjects.append(mage_subject(MAGE, note, untrained_mage(), scenes))
         absent = [one for one in absent if one.method != MAGE]
-    if paper:
+    if drawn:
         window, cache = paper_models()
         note = f"8 layers of 512, 8 slots of 128; {UNTRAINED}"
-        subjects.append(slot_subject(PAPER_WINDOW, note, window, scenes, EVERY_PHASE))
+        subjects.append(slot_subject(PAPER_WINDOW, note, window, scenes, EVERY_PHASE, drawn))
         subjects.append(
-            slot_subject(PAPER_CACHE, f"the same; {UNTRAINED}", cache, scenes, ("predict", "all"))
+            slot_subject(PAPER_CACHE, f"the same; {UNTRAINED}", cache, scenes, ("predict", "all"), drawn)
         )
     return subjects, absent
 
 
 def all_cells(sizes: Sizes) -> list[Cell]:
-    """Every measurement, small before large, so that the large ones' times can be foreseen."""
+    """Every measurement, small before large."""
     cells = []
     for count, batch in product(sizes.threads, sizes.batches):
         cells.append(Cell("encode", 1, batch, count))
@@ -222,31 +227,6 @@ def all_cells(sizes: Sizes) -> list[Cell]:
             Cell(phase, frames, batch, count) for phase, frames in product(EVERY_PHASE[1:], sizes.frames)
         ]
     return cells
-
-
-def works_of(
-    cell: Cell, subjects: Sequence[Subject], seconds: dict[tuple[str, Cell], np.ndarray], sizes: Sizes
-) -> dict[str, Work]:
-    """What is to be timed in a cell: what the subjects can do, and will not take too long for."""
-    works = {}
-    for subject in subjects:
-        work = subject.work(cell)
-        if work is not None and foreseen(subject.name, cell, seconds) <= sizes.longest:
-            works[subject.name] = work
-    return works
-
-
-def foreseen(name: str, cell: Cell, seconds: dict[tuple[str, Cell], np.ndarray]) -> float:
-    """About how many seconds a cell will take, from the nearest smaller one; 0 where there is none."""
-    smaller = [
-        (other.size, float(np.median(taken)) * cell.size / other.size)
-        for (who, other), taken in seconds.items()
-        if who == name
-        and other.phase == cell.phase
-        and other.threads == cell.threads
-        and other.size < cell.size
-    ]
-    return max(smaller)[1] if smaller else 0.0
 
 
 def plan_works(world_model: WorldModel, seed: int) -> dict[str, Work]:

@@ -77,15 +77,15 @@ def build_report(
     results: Results,
     notes: Mapping[str, str],
     absent: Sequence[Absent],
-    longest: float,
+    drawn: int,
     busy: float,
     command: str,
 ) -> Report:
     """The page.
 
     Args:
-        notes: what each subject is, in a line. absent: baselines that are not there. longest: what would have taken
-            more seconds was left out. busy: how busy the machine was before the study, 1 for all cores. command:
+        notes: what each subject is, in a line. absent: baselines that are not there. drawn: the most frames that are
+            drawn at the paper's sizes. busy: how busy the machine was before the study, 1 for all cores. command:
             what to type.
     """
     rows = results.rows
@@ -105,8 +105,8 @@ def build_report(
         "Where the time goes",
         f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). Encode: "
         "one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours and masks. "
-        "All: from observed frames to imagined ones. A dash: there is no such phase, or it would have taken more than "
-        f"{longest:g} s. {what}. {lacking}",
+        "All: from observed frames to imagined ones. A dash: there is no such phase; or, at the paper's sizes, more "
+        f"than {drawn} frames to draw. {what}. {lacking}",
         [
             *(phase_table(rows, t, b, frames) for t in reversed(threads) for b in batches),
             _plot(rows, threads_word(threads[-1]), frames),

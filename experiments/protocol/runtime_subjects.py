@@ -45,11 +45,6 @@ class Cell:
     batch: int
     threads: int
 
-    @property
-    def size(self) -> int:
-        """Frames in all: what time grows with, roughly."""
-        return self.frames * self.batch
-
 
 @dataclass(frozen=True, eq=False)
 class Subject:
@@ -78,14 +73,25 @@ class Scenes:
 
 
 def slot_subject(
-    name: str, note: str, world_model: WorldModel, scenes: Scenes, phases: tuple[Phase, ...]
+    name: str,
+    note: str,
+    world_model: WorldModel,
+    scenes: Scenes,
+    phases: tuple[Phase, ...],
+    drawn: int | None = None,
 ) -> Subject:
-    """A model with slots, in its phases. What comes before a phase is computed once and not timed."""
+    """A model with slots, in its phases. What comes before a phase is computed once and not timed.
+
+    Args:
+        drawn: the most frames of all scenes together that it is asked to draw; None for any number.
+    """
     model = world_model.model
     longest = world_model.longest_horizon
 
     def work(cell: Cell) -> Work | None:
         if cell.phase not in phases or (longest is not None and cell.frames > longest):
+            return None
+        if cell.phase in ("decode", "all") and drawn is not None and cell.frames * cell.batch > drawn:
             return None
         images, texts = scenes.images_BHW3[: cell.batch], list(scenes.texts[: cell.batch])
         if cell.phase == "encode":

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from experiments.protocol.runtime_rows import OURS, WINDOW, cell_rows, headline, query_rows, ratio_rows
-from experiments.protocol.runtime_subjects import Cell, published_form
+from experiments.protocol.runtime_subjects import Cell, Scenes, published_form, slot_subject
 from experiments.protocol.timing import machine_in_words, median_interval, race
-from experiments.runtime import Args, Sizes, all_cells, foreseen, main
+from experiments.runtime import Args, Sizes, all_cells, main
 from tests.textocvp.conftest import PLACED, build
 from textocvp.world_model import WorldModel
 
@@ -56,17 +56,22 @@ def test_the_median_has_an_interval_of_order_statistics() -> None:
         median_interval(np.array([]))
 
 
-def test_what_would_take_too_long_is_foreseen_from_the_nearest_smaller_one() -> None:
-    seconds = {
-        ("a", Cell("decode", 1, 1, 1)): np.array([0.1]),
-        ("a", Cell("decode", 9, 1, 1)): np.array([0.45]),
-        ("a", Cell("predict", 9, 1, 1)): np.array([70.0]),
-        ("b", Cell("decode", 9, 1, 1)): np.array([80.0]),
-    }
-    assert foreseen("a", Cell("decode", 9, 16, 1), seconds) == pytest.approx(0.45 * 16)
-    assert foreseen("a", Cell("decode", 9, 16, 2), seconds) == 0.0
-    cells = all_cells(Sizes((1, 9), (1, 16), 3, 1.0, 1.0, threads=(1, 2)))
+def test_every_cell_once() -> None:
+    cells = all_cells(Sizes((1, 9), (1, 16), 3, 1.0, 1, threads=(1, 2)))
     assert len(cells) == len(set(cells)) == 2 * 2 * (1 + 3 * 2)
+
+
+def test_few_frames_are_drawn_where_that_is_slow() -> None:
+    scenes = Scenes(np.zeros((2, 32, 32, 3), np.uint8), ("put the red block in the blue bowl",) * 2)
+    subject = slot_subject("a", "", WorldModel(build(PLACED)), scenes, ("predict", "decode", "all"), drawn=4)
+    asked = [
+        (phase, t, b) for phase in ("encode", "predict", "decode", "all") for t in (2, 4, 9) for b in (1, 2)
+    ]
+    done = {cell for cell in asked if subject.work(Cell(*cell, 1)) is not None}
+    # Nine frames are beyond this model, encoding was not asked for, and 4 frames of 2 scenes are too many to draw.
+    assert done == {("predict", t, b) for t in (2, 4) for b in (1, 2)} | {
+        (phase, t, b) for phase in ("decode", "all") for t, b in ((2, 1), (2, 2), (4, 1))
+    }
 
 
 def test_ratios_are_of_rounds_not_of_medians() -> None:
@@ -100,7 +105,7 @@ def test_the_published_form_has_the_same_sizes() -> None:
 
 
 def test_a_whole_study(tmp_path: Path) -> None:
-    tiny = Sizes(frames=(1, 2), batches=(1, 2), repeats=3, seconds=0.0, longest=5.0, threads=(1,))
+    tiny = Sizes(frames=(1, 2), batches=(1, 2), repeats=3, seconds=0.0, drawn=1, threads=(1,))
     main(Args(out=tmp_path, quick=True), sizes=tiny, paper=False)
     data = json.loads((tmp_path / "results.json").read_text())
     assert data["study"] == "runtime" and data["versions"]["machine"] == machine_in_words()
