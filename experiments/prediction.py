@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel, find_contenders
+from experiments.protocol.contenders import FAR, Contender, LoadVideo, LoadVideoModel, find_contenders
 from experiments.protocol.film_gallery import FilmPicture, extremes
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.prediction import (
@@ -60,6 +60,8 @@ class Args(StudyArgs):
     """Folder for results.json, report.html, plots and clips."""
     scenes: int = 0
     """Scenes of the test split; 0 for 60, or 8 with --quick."""
+    far: str = FAR.checkpoint
+    """A checkpoint of ours that looks 40 frames ahead, for the curves."""
     ocvp_seq: str = "ocvp-seq-small"
     """Checkpoint of OCVP-Seq: a bundled name, a folder or a hub id."""
     non_oc: str = "non-oc-small"
@@ -118,7 +120,7 @@ def main(
     load, sizes = load or LoadCheckpoint(args.checkpoint), sizes or args.sizes
     started = time.monotonic()
     asked = load().checkpoint
-    named = {"OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
+    named = {FAR.method: args.far, "OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
     loads = {method: LoadVideo(name) for method, name in named.items()} if baselines is None else baselines
     contenders, absent = find_contenders(loads)
     if measures is None:
@@ -176,13 +178,13 @@ def choose(
     means = [float(outcome.of("ours").curves[metric][: LENGTHS[-1]].mean()) for outcome in outcomes]
     badness = [-mean if metric == "ssim" else mean for mean in means]
     cases = list(zip(outcomes, means, strict=True))
+    # An episode has 24 frames, so ours is shown once.
+    shown = tuple(contender for contender in contenders if contender.method != FAR.method)
     pictures = []
     for best, chosen in zip((True, False), extremes(cases, badness, count), strict=True):
         for rank, (outcome, mean) in enumerate(chosen, start=1):
             caption = f"{METRICS[metric]} {mean:.3f}"
-            pictures.append(
-                FilmPicture(outcome.scene, tuple(contenders), seed, "prediction", rank, best, caption)
-            )
+            pictures.append(FilmPicture(outcome.scene, shown, seed, "prediction", rank, best, caption))
     return pictures
 
 

@@ -23,7 +23,6 @@ from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel
 from experiments.protocol.film_gallery import FilmPicture, extremes
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.gallery import choose_loop
-from experiments.protocol.predicted import HORIZON
 from experiments.protocol.robustness import (
     LENGTHS,
     LOOP_METHODS,
@@ -32,6 +31,7 @@ from experiments.protocol.robustness import (
     WHOLE,
     RobustOutcome,
     RobustScene,
+    difference_rows,
     imagined_columns,
     loop_columns,
     rows_of,
@@ -155,7 +155,8 @@ def main(
             if len(outcomes) % 5 == 0:
                 rows = rows_of(imagined_columns(outcomes, measures.metrics))
                 progress.show(*(frame_table(rows, split, absent, measures) for split in SPLITS))
-        rows = rows_of(imagined_columns(outcomes, measures.metrics))
+        columns = imagined_columns(outcomes, measures.metrics)
+        rows = [*rows_of(columns), *difference_rows(columns)]
         for episode in progress.track("closed loop", pool.run(episodes)):
             acted.append(episode)
             if len(acted) % 5 == 0:
@@ -163,8 +164,8 @@ def main(
                 progress.show(*(mask_table(now, split, absent) for split in SPLITS))
         rows += rows_of(loop_columns(acted))
         films = choose_films(outcomes, contenders, measures, args.seed, sizes.clips)
-        columns = {(split, 0): name for split, name in SPLITS.items()}
-        robot = choose_loop(acted, columns, sizes.acted // 2)
+        names = {(split, 0): name for split, name in SPLITS.items()}
+        robot = choose_loop(acted, names, sizes.acted // 2)
         progress.expect("films", len(films))
         progress.expect("robot's films", len(robot))
         clips = list(progress.track("films", pool.run(films)))
@@ -209,7 +210,7 @@ def choose_films(
         if outcome.scene.split not in SHIFTED:
             continue
         ours = outcome.scores[0]
-        mean = float(ours.curves[metric][:HORIZON].mean())
+        mean = float(ours.curves[metric].mean())
         good = outcome.success.get("ours")
         cases.append((outcome, mean, good))
         # A failure is worse than any success; the metrics stay well below 1.

@@ -84,6 +84,11 @@ FAR = Baseline(
     f"{_DATA} --out runs/window40 --steps 600 --batch 16 --autoregressive 1.0 --horizon 20 --learning-rate 3e-4 "
     "--warmup 50",
 )
+#: To be said wherever they stand beside ours.
+TRAINED_LITTLE = (
+    "The bundled baselines are small and were trained for minutes on two cores, as their cards say: none of them was "
+    "trained to the end."
+)
 NOTES = {baseline.method: baseline.note for baseline in (FAR, *BASELINES)}
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.protocol.contenders import NOTES, Absent, Contender, absent_text
+from experiments.protocol.contenders import FAR, NOTES, TRAINED_LITTLE, Absent, Contender, absent_text
 from experiments.protocol.frame_scores import BOTTOM_ROWS, METRICS, PSNR_CAP, UPPER, Measures
 from experiments.protocol.paper import CLIPORT, PAPER_LENGTHS, PaperFigures
 from experiments.protocol.prediction import FARTHEST, LENGTHS, SPLIT
@@ -29,6 +29,7 @@ from experiments.reporting.table import DASH, Kind
 LABELS = {"ours": "TextOCVP, ours"}
 ROWS: dict[str, tuple[Kind, str]] = {
     "ours": ("ours", "imagined from one frame and the sentence"),
+    FAR.method: ("ours", NOTES[FAR.method]),
     "OCVP-Seq": ("control", NOTES["OCVP-Seq"]),
     "Non-OC": ("control", NOTES["Non-OC"]),
     "MAGE": ("control", NOTES["MAGE"]),
@@ -130,7 +131,8 @@ def build_report(
         "As in the paper's table",
         "Every model sees the first frame of a held-out scene and the sentence, and imagines; the expert carries the "
         "sentence out in the simulator; frames are compared one by one. The paper's figures come from other pictures: "
-        "compare orders and distances, not heights. What a dash stands for is said in the last section.",
+        "compare orders and distances, not heights. "
+        f"{TRAINED_LITTLE} What a dash stands for is said in the last section.",
         [paper_table(rows, absent), _main_plot(rows, measures), episode_table(rows, absent)],
     )
     curves = Section(
@@ -188,7 +190,7 @@ def _models(results: Results, contenders: Sequence[Contender]) -> Table:
     where = results.checkpoint
     lines = [line(LABELS["ours"], where.name, where.sha256, longest, "slots and text", "ours")]
     lines += [
-        line(one.method, one.checkpoint, one.sha256, one.longest, NOTES[one.method], "control")
+        line(one.method, one.checkpoint, one.sha256, one.longest, NOTES[one.method], ROWS[one.method][0])
         for one in contenders
     ]
     return Table("Models", ("checkpoint", "frames at once", "SHA-256"), lines)

@@ -14,6 +14,8 @@ from experiments.protocol.robustness import (
     Column,
     RobustOutcome,
     RobustScene,
+    difference_rows,
+    drop_difference,
     imagined_columns,
 )
 from experiments.protocol.robustness_report import BARS, percent, verdict
@@ -44,6 +46,30 @@ def test_a_drop_is_how_much_worse_a_figure_is() -> None:
     assert better is not None and (better.low, better.value, better.high) == pytest.approx((-0.1,) * 3)
     assert column("iou", [0.0, 0.0], [0.5]).drop("unseen_colors") is None  # nothing to fall from
     assert success.drop("more_objects") is None
+
+
+def test_drops_are_compared_scene_by_scene() -> None:
+    """Ours grows from .1 by a half and by nothing, MAGE by as much and a fifth more of its .2 in every scene."""
+    ours = column("st_lpips", [0.1, 0.1], [0.15, 0.1])
+    mage = Column(
+        "MAGE",
+        "9 frames",
+        "st_lpips",
+        {"test": np.array([0.2, 0.2]), "unseen_colors": np.array([0.34, 0.24])},
+    )
+    found = drop_difference(ours, mage, "unseen_colors")
+    assert found is not None and (found.low, found.value, found.high) == pytest.approx((-0.2,) * 3)
+    (row,) = difference_rows([ours, mage])
+    assert (row.method, row.split, row.metric) == (
+        "ours minus MAGE",
+        "unseen_colors",
+        "st_lpips_drop_difference",
+    )
+    ssim = column("ssim", [0.8, 0.8], [0.6, 0.6])
+    other = column("ssim", [0.8, 0.8], [0.4, 0.4])
+    difference = drop_difference(ssim, other, "unseen_colors")
+    assert difference is not None and difference.value == pytest.approx(-0.25)
+    assert drop_difference(ours, column("st_lpips", [0.1], [0.1]), "unseen_colors") is None
 
 
 def test_rows_of_a_figure() -> None:
@@ -96,7 +122,7 @@ def test_bars_are_passed_missed_or_undecided() -> None:
     assert verdict(drop, results(lpips_drop_unseen_colors=0.2, lpips_drop_unseen_colors_mage=0.2)) == "miss"
     assert verdict(drop, results(lpips_drop_unseen_colors=0.2)) == "undecided: no MAGE"
     assert verdict(drop, results()) == "undecided: no LPIPS"
-    assert percent(-0.064) == "-6.4 %"
+    assert percent(-0.064) == "-6.4 %" and percent(-0.0) == "0.0 %"
 
 
 def test_without_a_learned_distance_its_headline_is_absent() -> None:
@@ -112,6 +138,7 @@ def test_a_model_that_is_always_right_is_judged_right_with_and_without_its_own_m
     }  # fmt: skip
     # The double's parser knows what happened whatever it is shown, so REREAD and `copy frame` are right here too.
     assert outcome.mean("ours", "iou", 19) is not None and outcome.mean("MAGE", "iou", 19) is None
+    assert len(outcome.scores[0].curves["ssim"]) == 19
     assert len(outcome.ious["MAGE"]) == 12 and "MAGE" not in outcome.success
 
 
