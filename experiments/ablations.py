@@ -43,7 +43,6 @@ from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgre
 from textocvp.model import CheckpointError
 
 VARIANTS = 3
-WITHOUT_JEDI = "the ablation study compares single frames only"
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
         for stage in ("predictor", "parser")
     }
     counts = tuple(Entrant(slots_name(k), LoadSlots(args.checkpoint, k)) for k in slot_counts)
-    measures = available_measures(None, (), WITHOUT_JEDI)
+    measures = available_measures(None, ())
     following = [
         *(
             FollowingScene(scene, entrants["predictor"], VARIANTS, args.seed, measures)

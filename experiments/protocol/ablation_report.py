@@ -141,7 +141,7 @@ def build_report(
     predictors = Section(
         "Predictor and text encoder",
         f"{intro} {measures.absent}",
-        [*tables, *_predictor_plot(rows, found)],
+        [*tables, *predictor_plot(rows, found)],
     )
     parsers = Section(
         "First slots and decoder",
@@ -190,12 +190,13 @@ def _cards(results: Results) -> list[Card]:
     ]
 
 
-def _predictor_plot(rows: Sequence[Row], found: Sequence[FoundRun]) -> list[Figure]:
+def predictor_plot(rows: Sequence[Row], found: Sequence[FoundRun]) -> list[Figure]:
+    """Where the block ends, for every trained predictor; nothing where there is none."""
     runs = [one.run for one in found if one.run.stage == "predictor" and one.state == "trained"]
     if not runs:
         return []
     measured = {
-        (r.method, r.split, r.variant): (r.value, r.low, r.high) for r in rows if "success" in r.metric
+        (r.method, r.split, r.variant): (r.value, r.low, r.high) for r in rows if r.metric == "ends_in_bowl"
     }
     series = [
         Series(title, [measured.get((run.name, split, variant)) for run in runs])

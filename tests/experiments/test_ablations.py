@@ -9,7 +9,7 @@ import pytest
 
 import textocvp
 from experiments.ablations import Args, Sizes, look, main
-from experiments.protocol.ablation_report import predictor_table
+from experiments.protocol.ablation_report import predictor_plot, predictor_table
 from experiments.protocol.ablation_rows import following_rows, parsing_rows, slots_name
 from experiments.protocol.ablation_runs import find_run, run_named
 from experiments.protocol.ablation_scenes import (
@@ -119,6 +119,18 @@ def test_rows_count_scenes() -> None:
         "ari": 0.3,
         "psnr": 20,
     }
+
+
+def test_the_plot_shows_the_columns_that_it_names(runs: Path) -> None:
+    found, _ = look(runs)
+    outcomes = [
+        FollowingOutcome(
+            scene, (), {"base": Followed(np.zeros(2, bool), np.ones(2, bool), np.zeros(2, bool), {})}
+        )
+        for scene in test_scenes("controllability", 2, 0)
+    ]
+    (figure,) = predictor_plot(following_rows(outcomes), found)
+    assert "original: base 1.00" in figure.alt and "three other bowls: base 1.00" in figure.alt
 
 
 def test_a_table_without_any_figure_is_a_table(tmp_path: Path) -> None:
