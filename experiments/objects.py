@@ -131,7 +131,7 @@ def main(
         for outcome in progress.track("scenes", pool.run(units)):
             outcomes.append(outcome)
             if len(outcomes) % 4 == 0:
-                progress.show(iou_table(method_rows(outcomes, ["iou"]), "iou", "Mask IoU"))
+                progress.show(iou_table(method_rows(outcomes, ["iou"]), "iou", "Mask IoU", single=False))
         chosen = choose_objects(outcomes, args.seed, sizes.clips, sizes.apart)
         pictures: list[ObjectPictures] = list(progress.track("pictures", pool.run(chosen)))
     rows = [*method_rows(outcomes, list(METRICS)), *difference_rows(outcomes)]
@@ -149,8 +149,8 @@ def main(
     with folder.fill() as partial:
         report.write(partial)
     progress.print(
-        iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True),
-        iou_table(rows, "iou_moving", "Mask IoU, named block and arm"),
+        iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True, single=False),
+        iou_table(rows, "iou_moving", "Mask IoU, named block and arm", single=False),
     )
     progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
     return results

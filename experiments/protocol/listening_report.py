@@ -184,7 +184,7 @@ def _heads(rows: Sequence[Row], method: str, role: str) -> Figure:
     of = "" if method == OURS else f", {SILENT}"
     return heat_map(
         name, values, [f"layer {n + 1}" for n in range(layers)], [f"head {h + 1}" for h in range(heads)],
-        label="attends most", caption=f"How often the named {role} attends most to its colour word{of}.",
+        label="attends most", caption=f"How often the named {role} attends most to its colour word{of}.", top=1.0,
     )  # fmt: skip
 
 

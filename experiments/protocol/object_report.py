@@ -46,6 +46,8 @@ METHODS: dict[str, tuple[Kind, str]] = {
     "copy seed": ("control", "the first frame's masks held still"),
     "wrong text": ("control", "imagined with a sentence that names something else"),
 }
+#: Each method's colour in every plot.
+HUES = {"ours": 0, FAR: 7, "true frames": 1, "OCVP-Seq": 3, "copy seed": 2, "wrong text": 4}
 # Mask IoU on CLIPort after 9 and 19 frames.
 PAPER = {"ours": (0.573, 0.569), "true frames": (0.554, 0.553), "copy seed": (0.540, 0.525)}
 PAPER_NAMES = {
@@ -66,16 +68,19 @@ def frame_at(length: int) -> str:
     return f"frame {length}"
 
 
-def iou_table(rows: Sequence[Row], metric: str, title: str, *, paper: bool = False) -> Table:
+def iou_table(
+    rows: Sequence[Row], metric: str, title: str, *, paper: bool = False, single: bool = True
+) -> Table:
     """One metric of all methods: means up to each length, then single frames.
 
     Args:
         metric: its name in results.json. title: of the table.
         paper: whether the paper's figures stand beside.
+        single: whether the single frames do; a terminal has no room for them.
     """
     found = {(row.method, row.variant): row for row in rows if row.metric == metric}
     known = [length for length in LENGTHS if any(variant == mean_to(length) for _, variant in found)]
-    variants = [*map(mean_to, known), *map(frame_at, known)]
+    variants = [*map(mean_to, known), *(map(frame_at, known) if single else ())]
     lines = []
     for method, (kind, note) in METHODS.items():
         cells = [Cell.of(found.get((method, variant)), 3) for variant in variants]
@@ -223,13 +228,15 @@ def _cards(results: Results) -> list[Card]:
 def _dots(results: Results) -> Figure:
     groups = {"9": 9, "19": 19, "24": 24}
     series = []
-    for color, method in enumerate(("ours", "true frames", "copy seed", "wrong text")):
+    for method in ("ours", "true frames", "OCVP-Seq", "copy seed", "wrong text"):
         found = [results.find(method, mean_to(length), "iou") for length in groups.values()]
-        series.append(Series(method, [(r.value, r.low, r.high) if r else None for r in found], color=color))
-    for color, (method, values) in enumerate(PAPER.items()):
-        points = [*((value, value, value) for value in values), None]
+        points = [(r.value, r.low, r.high) if r else None for r in found]
+        if any(points):
+            series.append(Series(method, points, color=HUES[method]))
+    for method, values in PAPER.items():
+        quoted = [*((value, value, value) for value in values), None]
         short = PAPER_NAMES[method].removeprefix("paper, ").removesuffix(" on true frames")
-        series.append(Series(f"{short}, paper", points, hollow=True, color=color))
+        series.append(Series(f"{short}, paper", quoted, hollow=True, color=HUES[method]))
     caption = (
         "Mean of the first 9, 19 and 24 predicted frames, 95 % intervals over scenes; rings are the paper's."
     )
@@ -247,4 +254,5 @@ def _curves(outcomes: Sequence[ObjectOutcome], field: str, label: str, name: str
             intervals = [bootstrap_interval(column, resamples=500) for column in columns]
             curves.append((method, np.array([(i.value, i.low, i.high) for i in intervals])))
     caption = "Mean over scenes with its 95 % interval."
-    return curve_plot(name, curves, label=label, across="frame", caption=caption)
+    hues = [HUES[method] for method, _ in curves]
+    return curve_plot(name, curves, label=label, across="frame", caption=caption, colors=hues)

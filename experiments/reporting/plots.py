@@ -106,8 +106,8 @@ def interval_plot(
         axes.set_xlabel(label)
         axes.grid(axis="x", color=theme.faint, linewidth=0.8)
         axes.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=min(len(series), 4), frameon=False,
-            labelcolor=theme.ink, fontsize=9, handletextpad=0.2, columnspacing=1.4,
+            loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=len(series) if len(series) < 5 else 3,
+            frameon=False, labelcolor=theme.ink, fontsize=9, handletextpad=0.2, columnspacing=1.4,
         )  # fmt: skip
 
     alt = "; ".join(
@@ -126,18 +126,19 @@ def heat_map(
     *,
     label: str,
     caption: str = "",
+    top: float | None = None,
 ) -> Figure:
-    """A map of values (rows, columns) from 0 up, each cell with its figure."""
+    """A map of values (rows, columns) from 0 up, each cell with its figure; `top` (default: the largest) is darkest."""
 
     def draw(axes: Axes, theme: Theme) -> None:
         ramp = LinearSegmentedColormap.from_list("calm", [theme.page, theme.series[0]])
-        top = float(values.max()) or 1.0
-        axes.imshow(values, cmap=ramp, vmin=0, vmax=top, aspect="auto")
+        darkest = top or float(values.max()) or 1.0
+        axes.imshow(values, cmap=ramp, vmin=0, vmax=darkest, aspect="auto")
         axes.set_xticks(range(len(columns)), columns, rotation=0 if len(columns) < 10 else 30)
         axes.set_yticks(range(len(rows)), rows)
         axes.xaxis.tick_top()
         for (r, c), value in np.ndenumerate(values):
-            strong = value > 0.6 * top
+            strong = value > 0.6 * darkest
             axes.text(c, r, f"{value:.2f}", ha="center", va="center", fontsize=9,
                       color=theme.page if strong else theme.ink)  # fmt: skip
         axes.set_xticks(np.arange(-0.5, len(columns)), minor=True)

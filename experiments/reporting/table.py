@@ -30,7 +30,8 @@ class Cell:
         """The cell of a row; a dash while there is none yet."""
         if row is None:
             return cls(DASH)
-        interval = f"{row.low:.{digits}f}{DASH}{row.high:.{digits}f}"
+        between = " to " if row.low < 0 else DASH  # a dash beside a minus sign cannot be read
+        interval = f"{row.low:.{digits}f}{between}{row.high:.{digits}f}"
         return cls(f"{row.value:.{digits}f}", "" if row.low == row.high else interval, row.n)
 
 

@@ -110,6 +110,7 @@ def test_the_table_reads_the_same_everywhere() -> None:
     assert "| ours | 0.90 |" in table.to_markdown()
     assert Cell.of(None).text == "\u2013"
     assert Cell.of(Row("a", "b", "c", "d", 0.5, 0.5, 0.5, 1)).interval == ""
+    assert Cell.of(Row("a", "b", "c", "d", -0.5, -0.6, -0.4, 1)).interval == "-0.60 to -0.40"
 
 
 def test_progress_in_a_file_is_plain_lines() -> None:
