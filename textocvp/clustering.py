@@ -103,19 +103,20 @@ class ClusterInitializer(nn.Module):
         background_B1C = colors_BNC.median(dim=1, keepdim=True).values
         to_background_BN = (colors_BNC - background_B1C).square().sum(-1)
 
-        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots)
+        # A thing may take two seeds, so where more slots are asked for there are more seeds, too.
+        seeds = max(self.seeds, num_slots + 2)
+        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, seeds)
         onehot_BNS = self._k_means(points_BNC, to_background_BN, centers_BSC, used_BS)
         onehot_BSN = self._unite(onehot_BNS.transpose(1, 2), colors_BNC, H, W)
         return self._largest(onehot_BSN, num_slots, H, W)
 
     def _seed(
-        self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int, num_slots: int
+        self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int, seeds: int
     ) -> tuple[Tensor, Tensor]:
         B, _, C = points_BNC.shape
         nearest_BN = to_background_BN.clone()
         centers, used = [], []
-        # A thing may take two seeds, so where more slots are asked for there are more seeds, too.
-        for _ in range(max(self.seeds, num_slots + 2)):
+        for _ in range(seeds):
             # Blurred, so that a seed lies inside a region and not on an odd pixel of its edge.
             smooth_BN = F.avg_pool2d(nearest_BN.view(B, 1, H, W), 3, 1, 1, count_include_pad=False).flatten(1)
             smooth_BN = torch.where(
@@ -180,16 +181,13 @@ class FeatureClusters(ClusterInitializer):
     of them one thing is known for colours only.
 
     Args:
-        seeds: how many clusters to start from, the background not counted.
         rounds: k-means rounds.
         background_distance: share of the largest squared distance from the background above which a location can seed.
         place_weight: length of the image's half side, in units of the largest distance.
     """
 
-    def __init__(
-        self, seeds: int = 12, rounds: int = 4, background_distance: float = 0.3, place_weight: float = 0.3
-    ) -> None:
-        super().__init__(seeds, rounds, background_distance, min_pixels=1)
+    def __init__(self, rounds: int = 4, background_distance: float = 0.3, place_weight: float = 0.3) -> None:
+        super().__init__(rounds=rounds, background_distance=background_distance, min_pixels=1)
         self.place_weight = place_weight
 
     @torch.no_grad()
@@ -214,7 +212,8 @@ class FeatureClusters(ClusterInitializer):
         points_BNC = torch.cat(
             [points_BNC / largest_B1[..., None].sqrt(), place_N2.expand(B, -1, -1)], dim=-1
         )
-        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots)
+        # As many as there are slots for them: none is united with another, and none should be left over.
+        centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots - 1)
         onehot_BNS = self._k_means(points_BNC, to_background_BN, centers_BSC, used_BS)
         return self._largest(onehot_BNS.transpose(1, 2), num_slots, H, W)
 

@@ -91,8 +91,7 @@ def test_the_preset_has_the_papers_sizes(image_decoder: str, decoder: int) -> No
     assert drawn.features_BLF is not None and drawn.features_BLF.shape == (1, 576, 768)
     assert drawn.frames_B3HW.shape == (1, 3, 336, 336) and drawn.masks_BKHW.shape == (1, 10, 336, 336)
     assert (config.parser.num_slots, config.parser.layout.dim) == (10, 128)
-    # The frozen encoder's 86 M are not among them.
-    assert count["parser"] < 2_000_000
+    assert count["parser"] == 1_104_000  # the frozen encoder's 86 M are not among them
 
 
 @pytest.mark.parametrize("initializer", ["gaussian", "cluster"])
