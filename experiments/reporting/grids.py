@@ -6,7 +6,6 @@ import io
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure as Canvas
@@ -15,6 +14,7 @@ from experiments.reporting.document import Figure
 from experiments.reporting.plots import DARK, LIGHT, Theme
 
 WIDTH = 7.6  # inches
+LETTER = 0.075  # inches that a letter of a row's name takes at most, on average
 GAP = 1  # pixels of the pictures, between them
 
 
@@ -44,8 +44,12 @@ def picture_grid(
         )
     height, width = pictures[0][0].shape[:2]
     down, across = height + GAP, width + GAP
+    left, top = 0.12 + LETTER * max(map(len, rows)), 0.3
+    wide = WIDTH - left - 0.04
+    high = wide * (len(rows) * down + GAP) / (len(columns) * across + GAP)
+    size = (WIDTH, high + top + 0.04)
 
-    def draw(axes: np.ndarray, theme: Theme) -> None:
+    def draw(canvas: Canvas, theme: Theme) -> None:
         # One image, not one panel a picture: laying out a hundred panels takes seconds.
         page, line = (np.array(to_rgb(color)) * 255 for color in (theme.page, theme.faint))
         sheet = np.tile(line, (len(rows) * down + GAP, len(columns) * across + GAP, 1))
@@ -54,17 +58,16 @@ def picture_grid(
                 alpha = picture[..., 3:] / 255 if picture.shape[-1] == 4 else 1.0
                 y, x = GAP + r * down, GAP + c * across
                 sheet[y : y + height, x : x + width] = picture[..., :3] * alpha + page * (1 - alpha)
-        (one,) = axes.flat
-        one.imshow(sheet.round().astype(np.uint8), interpolation="nearest")
-        one.set_xticks(GAP + across * np.arange(len(columns)) + width / 2, columns, fontsize=9)
-        one.set_yticks(GAP + down * np.arange(len(rows)) + height / 2, rows, fontsize=9)
-        one.xaxis.tick_top()
-        one.tick_params(colors=theme.ink, length=0, pad=4)
-        for spine in one.spines.values():
+        axes = canvas.add_axes((left / size[0], 0.04 / size[1], wide / size[0], high / size[1]))
+        axes.imshow(sheet.round().astype(np.uint8), interpolation="nearest", aspect="auto")
+        axes.set_xticks(GAP + across * np.arange(len(columns)) + width / 2, columns, fontsize=9)
+        axes.set_yticks(GAP + down * np.arange(len(rows)) + height / 2, rows, fontsize=9)
+        axes.xaxis.tick_top()
+        axes.tick_params(colors=theme.ink, length=0, pad=4)
+        for spine in axes.spines.values():
             spine.set_visible(False)
 
-    size = (WIDTH, 0.3 + (WIDTH - 1.5) * len(rows) * down / (len(columns) * across))
-    return _figure(name, draw, (1, 1), size, alt, caption)
+    return _figure(name, draw, size, alt, caption)
 
 
 def heat_grid(
@@ -94,12 +97,15 @@ def heat_grid(
         raise ValueError(f"values are {values.shape}, the names ask for {wanted}")
     top = float(np.nanmax(values)) or 1.0
 
-    def draw(axes: np.ndarray, theme: Theme) -> None:
+    def draw(canvas: Canvas, theme: Theme) -> None:
+        canvas.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, hspace=0.01, wspace=0.01)
+        axes = canvas.subplots(len(titles), len(titles[0]), squeeze=False)
         ramp = LinearSegmentedColormap.from_list("calm", [theme.page, theme.series[0]]).with_extremes(
             bad=theme.page
         )
         for (r, c), one in np.ndenumerate(axes):
             one.imshow(values[r, c], cmap=ramp, vmin=0, vmax=top, aspect="auto")
+            one.set_facecolor(theme.page)
             one.set_title(titles[r][c], fontsize=9, color=theme.ink, pad=4)
             one.set_yticks(range(len(rows)), rows if c == 0 else [""] * len(rows), fontsize=8)
             last = r == len(axes) - 1
@@ -112,26 +118,16 @@ def heat_grid(
 
     size = (WIDTH, 0.9 + len(titles) * (0.3 + 0.19 * len(rows)))
     alt = f"{label}: heat maps of {', '.join(rows)} against {', '.join(columns)}"
-    return _figure(name, draw, (len(titles), len(titles[0])), size, alt, caption)
+    return _figure(name, draw, size, alt, caption)
 
 
 def _figure(
-    name: str,
-    draw: Callable[[np.ndarray, Theme], None],
-    panels: tuple[int, int],
-    size: tuple[float, float],
-    alt: str,
-    caption: str,
+    name: str, draw: Callable[[Canvas, Theme], None], size: tuple[float, float], alt: str, caption: str
 ) -> Figure:
     def png(theme: Theme) -> bytes:
-        canvas = Canvas(figsize=size, dpi=130, facecolor=theme.page, layout="constrained")
-        canvas.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.01, wspace=0.01)  # type: ignore[union-attr,call-arg]
+        canvas = Canvas(figsize=size, dpi=130, facecolor=theme.page)
         FigureCanvasAgg(canvas)
-        axes: np.ndarray = canvas.subplots(*panels, squeeze=False)
-        for one in axes.flat:
-            assert isinstance(one, Axes)
-            one.set_facecolor(theme.page)
-        draw(axes, theme)
+        draw(canvas, theme)
         buffer = io.BytesIO()
         canvas.savefig(buffer, format="png", metadata={"Software": None})
         return buffer.getvalue()

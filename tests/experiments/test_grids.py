@@ -44,6 +44,11 @@ def test_pictures_stand_in_their_row_and_column() -> None:
     assert grid.wide
 
 
+def test_long_names_are_not_cut_off() -> None:
+    grid = picture_grid("g.png", [[flat(RED)] * 6], ["yellow bowl (named)"], list("123456"), alt="x")
+    assert (pixels(grid.light)[:, :8] == 255).all()
+
+
 def test_names_and_panels_must_fit() -> None:
     with pytest.raises(ValueError, match="1 x 2 names"):
         picture_grid("g.png", [[flat(RED)]], ["a"], ["1", "2"], alt="x")
