@@ -1,25 +1,43 @@
-"""Both stages of training on toy episodes, for tests that compare one process with several.
+"""Every stage of training on toy episodes, for tests that compare one process with several.
 
-accelerate launch --cpu --num_processes 2 -m tests.textocvp.both_stages FOLDER NAME
+torchrun --standalone --nproc_per_node 2 -m tests.textocvp.both_stages FOLDER NAME
 """
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
-from tests.textocvp.conftest import PLACED, PUBLISHED, build
+from tests.textocvp.conftest import PLACED, PUBLISHED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli, training
 from textocvp.config import PRESETS
+from textocvp.mage.config import MAGE_PRESETS, AxialConfig, MageConfig, VQVAEConfig
 
 STEPS = 3
+MAGE = MageConfig(
+    name="tiny-mage",
+    vqvae=VQVAEConfig(image_size=32, channels=8, blocks=1, codebook_size=16, code_dim=8),
+    text=SMALL_TEXT,
+    axial=AxialConfig(dim=16, layers=3, heads=2, hidden=16, frames=5),
+)
 RUNS = {
     "parser, drawn first slots": ["parser", "--preset", PUBLISHED.name],
     "parser, clusters, in parts": ["parser", "--preset", PLACED.name, "--accumulate", "2"],
     "parser, single frames": ["parser", "--preset", PLACED.name, "--clip", "1"],
-    "predictor, causal, image loss": ["predictor", "--parser", PLACED.name, "--image-weight", "1.0"],
-    "predictor, window": ["predictor", "--parser", PUBLISHED.name],
+    "predictor, causal, image loss": [
+        "predictor",
+        "--horizon",
+        "2",
+        "--image-weight",
+        "1.0",
+        "--parser",
+        PLACED.name,
+    ],
+    "predictor, window": ["predictor", "--horizon", "2", "--parser", PUBLISHED.name],
+    "vqvae": ["vqvae", "--preset", MAGE.name, "--restart-every", "1", "--stride", "2"],
+    "mage": ["mage", "--preset", MAGE.name, "--vqvae", "vqvae/checkpoint"],
 }
 
 
@@ -33,16 +51,21 @@ def write_inputs(folder: Path) -> None:
 
 def main(folder: Path, name: str) -> None:
     """Do every run of `RUNS` into `folder`/`name`, with the command that people use."""
-    PRESETS.update({config.name: config for config in (PLACED, PUBLISHED)})
-    training.LOG_EVERY = 1
-    for run, command in RUNS.items():
-        if command[0] == "predictor":
-            command = [*command[:2], str(folder / command[2]), *command[3:], "--horizon", "2"]
-        files = ["--data", folder / "train.h5", "--val", folder / "val.h5", "--out", folder / name / run]
-        lengths = ["--steps", str(STEPS), "--batch", "5", "--warmup", "1"]
-        status = cli.main(["train", *command, *map(str, files), *lengths])
-        if status:
-            sys.exit(status)
+    tiny = {config.name: config for config in (PLACED, PUBLISHED)}
+    with (
+        patch.dict(PRESETS, tiny),
+        patch.dict(MAGE_PRESETS, {MAGE.name: MAGE}),
+        patch.object(training, "LOG_EVERY", 1),
+    ):
+        for run, command in RUNS.items():
+            inputs = {"predictor": folder, "mage": folder / name}  # what the last argument is found in
+            if command[0] in inputs:
+                command = [*command[:-1], str(inputs[command[0]] / command[-1])]
+            files = ["--data", folder / "train.h5", "--val", folder / "val.h5", "--out", folder / name / run]
+            lengths = ["--steps", str(STEPS), "--batch", "5", "--warmup", "1"]
+            status = cli.main(["train", *command, *map(str, files), *lengths])
+            if status:
+                sys.exit(status)
 
 
 if __name__ == "__main__":

