@@ -196,8 +196,8 @@ def build_report(
     )
     texts = {
         "test": "Six objects, caption colours that were seen in training: what everything else is held against.",
-        "unseen_colors": "Six objects. Captions name CLIPort's test colours; four of them (pink, purple, white, orange) no "
-        "training sentence had.",
+        "unseen_colors": "Six objects. Captions name CLIPort's test colours, four of which no training sentence had: "
+        "pink, purple, white and orange.",
         "more_objects": "Eight objects; training had six.",
     }
     layout = (
