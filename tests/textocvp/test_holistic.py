@@ -111,13 +111,13 @@ def test_both_stages_train_it(tmp_path: Path, monkeypatch, capsys):
     write_toy_episodes(tmp_path / "train.h5", [9, 8, 9, 9])
     data = ["--data", str(tmp_path / "train.h5"), "--val", str(tmp_path / "train.h5")]
     parser, predictor = tmp_path / "parser", tmp_path / "predictor"
-    stage_1 = ["--preset", NON_OC.name, "--steps", "100", "--batch", "4", "--clip", "2"]
-    stage_1 += ["--warmup", "10", "--learning-rate", "4e-3"]
+    stage_1 = ["--preset", NON_OC.name, "--steps", "400", "--batch", "4", "--clip", "2"]
+    stage_1 += ["--warmup", "10", "--learning-rate", "5e-3"]
     cli.main(["train", "parser", *data, "--out", str(parser), *stage_1, "--evaluate-every", "100"])
     printed = capsys.readouterr().out
     assert "one slot: there are no masks to measure" in printed and "not good enough" not in printed
     quality = json.loads((parser / "quality.json").read_text())
-    assert quality["psnr"]["value"] > 17 and quality["object_miou"] is None  # 9 before training
+    assert quality["psnr"]["value"] > 19 and quality["object_miou"] is None  # the mean picture: 17.9
     assert iio.imread(parser / "samples" / "000100.png").shape == (4 * 2 * 32 * 2, 8 * 32 * 2, 3)
 
     stage_2 = ["--steps", "3", "--batch", "4", "--image-weight", "10", "--warmup", "1", "--horizon", "2"]
