@@ -106,7 +106,7 @@ def build_report(
         f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). Encode: "
         "one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours and masks. "
         "All: from observed frames to imagined ones. A dash: there is no such phase; or, at the paper's sizes, more "
-        f"than {drawn} frames to draw. {what}. {lacking}",
+        f"than {drawn} frames to draw; a quick run also leaves out large batches of what is slow. {what}. {lacking}",
         [
             *(phase_table(rows, t, b, frames) for t in reversed(threads) for b in batches),
             _plot(rows, threads_word(threads[-1]), frames),

@@ -53,11 +53,13 @@ class Subject:
     Attributes:
         name, note: of its row.
         work: the work of a cell; None for what it cannot do or is not asked.
+        heavy: whether it takes so long that a first look leaves out its large cells.
     """
 
     name: str
     note: str
     work: Callable[[Cell], Work | None]
+    heavy: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def slot_subject(
         layout, renderer = model.parser.layout, model.renderer
         return lambda: Rollout(slots_BTKD, tuple(texts), world_model.image_size, layout, renderer).frames
 
-    return Subject(name, note, work)
+    return Subject(name, note, work, heavy=drawn is not None)
 
 
 def mage_subject(name: str, note: str, video: MageVideoModel, scenes: Scenes) -> Subject:
@@ -140,7 +142,7 @@ def mage_subject(name: str, note: str, video: MageVideoModel, scenes: Scenes) ->
 
         return phase
 
-    return Subject(name, note, work)
+    return Subject(name, note, work, heavy=True)
 
 
 def untrained_mage() -> MageVideoModel:
