@@ -21,11 +21,10 @@ from typing import cast
 import numpy as np
 
 from experiments.protocol.arguments import StudyArgs, start
-from experiments.protocol.contenders import Absent, LoadVideo, find_contenders
+from experiments.protocol.contenders import FAR, Absent, LoadVideo, find_contenders
 from experiments.protocol.figures import mean_row
 from experiments.protocol.object_gallery import ObjectPictures, choose_objects
 from experiments.protocol.object_report import (
-    FAR,
     METHODS,
     METRICS,
     MINUS,
@@ -39,8 +38,6 @@ from experiments.protocol.object_scenes import LENGTHS, MaskScores, ObjectOutcom
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
 from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
-
-FAR_CHECKPOINT = "tabletop-small-40"
 
 
 @dataclass
@@ -57,8 +54,8 @@ class Args(StudyArgs):
     """Folder for results.json, report.html, plots and clips."""
     ocvp_seq: str = "ocvp-seq-small"
     """Checkpoint of OCVP-Seq, the baseline without text: a bundled name, a folder or a hub id."""
-    far: str = ""
-    """Checkpoint whose curves go on to 40 frames; empty: tabletop-small-40 beside tabletop-small, else none."""
+    far: str = FAR.checkpoint
+    """A checkpoint of ours that looks 40 frames ahead, for the curves."""
 
     @property
     def sizes(self) -> Sizes:
@@ -67,12 +64,11 @@ class Args(StudyArgs):
 
     def others(self) -> tuple[dict[str, LoadWorldModel], list[Absent]]:
         """The other models that imagine, and those that are not there."""
-        found, absent = find_contenders({"OCVP-Seq": LoadVideo(self.ocvp_seq)})
+        found, absent = find_contenders(
+            {FAR.method: LoadVideo(self.far), "OCVP-Seq": LoadVideo(self.ocvp_seq)}
+        )
+        # Both have slots, so what loads is a world model.
         loads = {one.method: cast(LoadWorldModel, one.load) for one in found}
-        far = self.far or (FAR_CHECKPOINT if self.checkpoint == StudyArgs.checkpoint else "")
-        if far:
-            loads[FAR] = LoadCheckpoint(far)
-            loads[FAR]()  # a wrong name is an error now, not after the first scene
         return loads, absent
 
 
@@ -176,7 +172,7 @@ def difference_rows(outcomes: Sequence[ObjectOutcome]) -> list[Row]:
     """Ours minus each other method, within each scene."""
     rows = []
     for method in METHODS:
-        if method in ("ours", FAR) or any(method not in outcome.scores for outcome in outcomes):
+        if method in ("ours", FAR.method) or any(method not in outcome.scores for outcome in outcomes):
             continue
         for metric in ("iou", "iou_moving"):
             for length in LENGTHS:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.protocol.contenders import Absent, absent_text
+from experiments.protocol.contenders import FAR, NOTES, TRAINED_LITTLE, Absent, absent_text
 from experiments.protocol.object_gallery import ObjectPictures
 from experiments.protocol.object_scenes import LENGTHS, ObjectOutcome
 from experiments.reporting import (
@@ -37,17 +37,16 @@ METRICS = {
     "iou_kept_moving": "kept_moving",
     "foreground_ari": "ari",
 }
-FAR = "ours, 40 frames"
 METHODS: dict[str, tuple[Kind, str]] = {
     "ours": ("ours", "imagined from one frame and the sentence"),
-    FAR: ("ours", "the checkpoint that was fine-tuned to look further ahead"),
+    FAR.method: ("ours", FAR.note),
     "true frames": ("ceiling", "the parser on the simulator's frames, nothing imagined"),
-    "OCVP-Seq": ("control", "a predictor of slots that hears no text"),
+    "OCVP-Seq": ("control", NOTES["OCVP-Seq"]),
     "copy seed": ("control", "the first frame's masks held still"),
     "wrong text": ("control", "imagined with a sentence that names something else"),
 }
 #: Each method's colour in every plot.
-HUES = {"ours": 0, FAR: 7, "true frames": 1, "OCVP-Seq": 3, "copy seed": 2, "wrong text": 4}
+HUES = {"ours": 0, FAR.method: 7, "true frames": 1, "OCVP-Seq": 3, "copy seed": 2, "wrong text": 4}
 # Mask IoU on CLIPort after 9 and 19 frames.
 PAPER = {"ours": (0.573, 0.569), "true frames": (0.554, 0.553), "copy seed": (0.540, 0.525)}
 PAPER_NAMES = {
@@ -152,7 +151,7 @@ def build_report(
     """
     rows = results.rows
     length = max(length for length in LENGTHS if results.find("ours", mean_to(length), "iou"))
-    missing = " " + absent_text(absent) if absent else ""
+    missing = f" {absent_text(absent)}" if absent else f" {TRAINED_LITTLE}"
     overlap = Section(
         "Mask IoU against the simulator",
         "Slots are matched to the blocks and bowls that are seen, anew in every frame (Hungarian), and overlaps are "

@@ -1,5 +1,6 @@
 """The object study: exact figures for masks drawn by hand, and for models that are broken in a known way."""
 
+import html
 import json
 from functools import lru_cache
 from pathlib import Path
@@ -10,7 +11,6 @@ import pytest
 from experiments.objects import Args, Sizes, main, method_rows
 from experiments.protocol import contenders
 from experiments.protocol.object_gallery import choose_objects
-from experiments.protocol.object_report import FAR
 from experiments.protocol.object_scenes import MaskScores, ObjectOutcome, ObjectScene, score_masks
 from experiments.protocol.scenes import draw, test_scenes, wrong_text
 from experiments.protocol.workers import Worker
@@ -155,7 +155,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contenders, "load_video_model", not_there)
-        args = Args(out=out, checkpoint="mine", quick=True, workers=1)
+        args = Args(out=out, quick=True, workers=1)
         main(args, LoadForesight("sees"), Sizes(scenes=1, clips=1, apart=1))
     return out
 
@@ -175,7 +175,9 @@ def test_the_figures_are_there_with_intervals(folder: Path) -> None:
 
 def test_the_page_shows_what_is_absent_and_every_slot(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    assert "OCVP-Seq is absent: not trained: `textocvp train predictor --preset ocvp-seq-small" in page
+    assert contenders.BASELINES[0].method == "OCVP-Seq"
+    for one in (contenders.BASELINES[0], contenders.FAR):
+        assert f"{one.method} is absent: not trained: `{one.train}`" in html.unescape(page)
     assert "Quick run" in page
     assert "paper, Copy-Seed" in page and "0.525" in page
     names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}
@@ -192,5 +194,5 @@ def test_an_unknown_baseline_is_an_early_error(tmp_path: Path) -> None:
 
 def test_the_shipped_model_goes_on_with_the_one_for_40_frames() -> None:
     loads, _ = Args().others()
-    assert loads[FAR]().longest_horizon == 40
-    assert FAR not in Args(checkpoint="mine").others()[0]
+    assert loads[contenders.FAR.method]().longest_horizon == 40
+    assert loads["OCVP-Seq"]().checkpoint.name == "ocvp-seq-small"
