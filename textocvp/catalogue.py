@@ -35,7 +35,6 @@ WHAT = {
     "non-oc": "Non-OC at the paper's sizes",
     "mage-small": "MAGE, no slots, small",
     "mage": "MAGE at its published sizes",
-    "mage-dino-small": "MAGE-DINO, small",
     "mage-dino": "MAGE-DINO at the paper's sizes (CLIPort)",
 }
 
@@ -110,8 +109,9 @@ def _entry(name: str, config: ModelConfig | MageConfig, bundled: bool) -> Entry:
 def _frozen_encoders(config: ModelConfig | MageConfig) -> list[str]:
     """Where the pretrained weights that it cannot do without come from."""
     needed = []
-    if isinstance(config, ModelConfig) and config.parser.encoder == "dinov2":
-        needed.append(config.parser.encoder_weights or DINO_HUB_ID)
+    looks = config.parser if isinstance(config, ModelConfig) else config.vqvae
+    if looks.encoder == "dinov2":
+        needed.append(looks.encoder_weights or DINO_HUB_ID)
     if config.text.kind == "t5":
         needed.append(config.text.weights or T5_HUB_ID)
     if config.text.kind == "minilm":

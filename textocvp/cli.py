@@ -19,6 +19,7 @@ from rich.tree import Tree
 from textocvp.config import preset, with_settings
 from textocvp.drawing import SUFFIXES
 from textocvp.model import CONFIG_FILE, CheckpointError
+from textocvp.video import load_video_model
 from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel
 
 
@@ -213,15 +214,14 @@ def _info(command: InfoCommand) -> None:
         _models()
         return
     console = Console()
-    world_model = WorldModel.from_pretrained(command.checkpoint)
-    model = world_model.model
-    console.print(f"[bold]{world_model.checkpoint.name}[/bold]  {world_model!r}", highlight=False)
-    if world_model.checkpoint.sha256:
-        console.print(f"sha256 of the weights: {world_model.checkpoint.sha256}", highlight=False)
+    loaded: Any = load_video_model(command.checkpoint)
+    model = loaded.model
+    console.print(f"[bold]{loaded.checkpoint.name}[/bold]  {loaded!r}", highlight=False)
+    if loaded.checkpoint.sha256:
+        console.print(f"sha256 of the weights: {loaded.checkpoint.sha256}", highlight=False)
     table = Table("part", "class", "parameters")
     table.columns[2].justify = "right"
-    for name in ("parser", "text", "predictor", "renderer"):
-        part = getattr(model, name)
+    for name, part in model.named_children():
         table.add_row(name, type(part).__name__, f"{sum(p.numel() for p in part.parameters()):,}")
     table.add_row("whole", type(model).__name__, f"{sum(p.numel() for p in model.parameters()):,}")
     console.print(table)

@@ -1,8 +1,9 @@
 """The frozen image encoder of the published CLIPort models: DINOv2 (Oquab et al. 2023), through transformers.
 
-Its weights are never part of our checkpoints. A checkpoint says where they were found (`parser.encoder_weights`) and
-which they are (`parser.encoder_fingerprint`), and other weights are an error. They are read when the first frame is
-encoded, so that a model can be built, counted and trained on cached features or slots without them; and never made up.
+Its weights are never part of our checkpoints. A checkpoint says where they were found (`parser.encoder_weights`, of
+MAGE-DINO `vqvae.encoder_weights`) and which they are (`encoder_fingerprint`), and other weights are an error. They are
+read when the first frame is encoded, so that a model can be built, counted and trained on cached features, slots or
+codes without them; and never made up.
 """
 
 from __future__ import annotations
@@ -46,16 +47,24 @@ class DinoEncoder(nn.Module):
         dim: width of its features.
         patch: side of its patches in pixels.
         fingerprint: of the weights that it must be; empty for any.
+        part: of the configuration, for messages that name a field.
 
     Attributes:
         fingerprint: of the weights; empty as long as none are known.
     """
 
     def __init__(
-        self, weights: str | Path = DINO_HUB_ID, *, dim: int = 768, patch: int = 14, fingerprint: str = ""
+        self,
+        weights: str | Path = DINO_HUB_ID,
+        *,
+        dim: int = 768,
+        patch: int = 14,
+        fingerprint: str = "",
+        part: str = "parser",
     ) -> None:
         super().__init__()
         self.weights, self.dim, self.patch, self.fingerprint = str(weights), dim, patch, fingerprint
+        self.part = part
         self._backbone: list[nn.Module] = []  # a list, so that it is not registered
 
     def cells(self, image_size: int) -> int:
@@ -66,7 +75,7 @@ class DinoEncoder(nn.Module):
         """
         if image_size % self.patch:
             raise ValueError(
-                f"parser.image_size: patches of {self.patch} pixels do not divide {image_size} pixels evenly"
+                f"{self.part}.image_size: patches of {self.patch} pixels do not divide {image_size} pixels evenly"
             )
         return image_size // self.patch
 
@@ -77,13 +86,13 @@ class DinoEncoder(nn.Module):
             DinoWeightsError: if they are missing or damaged, of another size, or not those of `fingerprint`.
         """
         if not self._backbone:
-            folder = weights_folder(self.weights)
+            folder = weights_folder(self.weights, self.part)
             found = fingerprint(folder)
             if self.fingerprint not in ("", found):
                 raise DinoWeightsError(
-                    f"parser.encoder_fingerprint: this was made with other weights of the image encoder "
+                    f"{self.part}.encoder_fingerprint: this was made with other weights of the image encoder "
                     f"({self.fingerprint[:12]}) than those in {folder} ({found[:12]}); give those in "
-                    "parser.encoder_weights"
+                    f"{self.part}.encoder_weights"
                 )
             backbone = read_backbone(folder)
             for field, wanted, has in (
@@ -92,7 +101,7 @@ class DinoEncoder(nn.Module):
             ):
                 if wanted != has:
                     raise DinoWeightsError(
-                        f"parser.{field} is {wanted}, that of the weights in {folder} is {has}"
+                        f"{self.part}.{field} is {wanted}, that of the weights in {folder} is {has}"
                     )
             self._backbone.append(backbone.eval().requires_grad_(False))
             self.fingerprint = found
@@ -115,7 +124,7 @@ class DinoEncoder(nn.Module):
         return states[:, 1:]  # without the class token
 
 
-def weights_folder(weights: str) -> Path:
+def weights_folder(weights: str, part: str = "parser") -> Path:
     """The folder of the weights of that name.
 
     Raises:
@@ -130,7 +139,7 @@ def weights_folder(weights: str) -> Path:
             raise DinoWeightsError(
                 f"the image encoder's weights {weights!r} are no folder here, and fetching them from the Hugging Face "
                 f"hub failed ({type(error).__name__}: {error}). Where there is a network: hf download {DINO_HUB_ID} "
-                f"{CONFIG_FILE} {WEIGHTS_FILE} --local-dir FOLDER; then set parser.encoder_weights=FOLDER"
+                f"{CONFIG_FILE} {WEIGHTS_FILE} --local-dir FOLDER; then set {part}.encoder_weights=FOLDER"
             ) from error
     missing = [name for name in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / name).is_file()]
     if missing:

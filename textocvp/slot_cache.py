@@ -173,9 +173,7 @@ def _parts(
     parser, source = parser_fingerprint(model), episodes_fingerprint(episodes)
     firsts = range(0, len(episodes), PART)[process::processes]
     parts = []
-    with tqdm(
-        total=len(firsts), desc=f"parsing {path.stem}", unit="part", disable=process > 0
-    ) as bar:
+    with tqdm(total=len(firsts), desc=f"parsing {path.stem}", unit="part", disable=process > 0) as bar:
         for first in firsts:
             part_path = _folder(path) / f"{first:06d}.h5"
             if part_path.exists():

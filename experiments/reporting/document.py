@@ -111,7 +111,10 @@ class Report:
     cards: Sequence[Card]
     sections: Sequence[Section]
     command: str
-    again: str = "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
+    again: str = (
+        "The seed fixes scenes, instructions and slots: "
+        "everything in results.json but the seconds comes out the same."
+    )
 
     def to_html(self) -> str:
         """The page, with every image inside it."""

@@ -13,7 +13,7 @@ import textocvp.slot_cache as module
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.episodes import EpisodeFile
-from textocvp.slot_cache import SlotCache, SlotCacheError, cached_slots, parser_fingerprint
+from textocvp.slot_cache import SlotCache, SlotCacheError, cached_slots, parse_share, parser_fingerprint
 
 
 @pytest.fixture
@@ -47,6 +47,29 @@ def test_second_time_nothing_is_parsed(episodes, tmp_path, monkeypatch):
     second = cached_slots(model, episodes, tmp_path / "slots.h5")
     assert np.array_equal(first.slots_NKD, second.slots_NKD)
     assert first.instructions == second.instructions
+
+
+def test_processes_share_the_parsing(episodes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "PART", 2)
+    model, parse, parsed = build(PLACED), module._parse, []
+
+    def counted(model, episodes, chosen, *rest):
+        parsed.append((chosen.start, chosen.stop))
+        return parse(model, episodes, chosen, *rest)
+
+    alone = cached_slots(model, episodes, tmp_path / "alone.h5")
+    monkeypatch.setattr(module, "_parse", counted)
+    shared = tmp_path / "shared.h5"
+    parse_share(model, episodes, shared, 1, 2)
+    assert parsed == [(2, 4)]
+    parse_share(model, episodes, shared, 0, 2)
+    assert parsed == [(2, 4), (0, 2), (4, 5)]
+    joined = cached_slots(model, episodes, shared)
+    assert len(parsed) == 3 and shared.exists() and not module._folder(shared).exists()
+    assert np.array_equal(joined.slots_NKD, alone.slots_NKD) and np.array_equal(joined.starts, alone.starts)
+    assert joined.instructions == alone.instructions
+    parse_share(model, episodes, shared, 1, 2)  # all there
+    assert len(parsed) == 3
 
 
 def test_killed_parsing_goes_on_and_gives_the_same(episodes, tmp_path, monkeypatch):

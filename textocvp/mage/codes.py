@@ -7,8 +7,7 @@ where each episode begins. It remembers which VQ-VAE and which episodes it was m
 from __future__ import annotations
 
 import hashlib
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -21,6 +20,7 @@ from textocvp.episodes import EpisodeFile
 from textocvp.mage.vqvae import VQVAE
 from textocvp.parser import to_frames
 from textocvp.slot_cache import SlotCacheError, episodes_fingerprint
+from textocvp.training import SettingsError
 
 
 class CodeCacheError(SlotCacheError):
@@ -51,8 +51,8 @@ class CodeCache:
 
 
 def vqvae_fingerprint(model: VQVAE) -> str:
-    """A hash of the configuration and the weights."""
-    digest = hashlib.sha256(json.dumps(asdict(model.config), sort_keys=True).encode())
+    """A hash of the weights, those of a frozen encoder included."""
+    digest = hashlib.sha256(model.config.encoder_fingerprint.encode())
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
@@ -88,6 +88,16 @@ def cached_codes(model: VQVAE, episodes: EpisodeFile, path: Path, *, batch: int 
         file.attrs.update(made_from)
     unfinished.replace(path)  # killed at any moment, either the whole file is there or none
     return cache
+
+
+def check_size(model: VQVAE, *sources: EpisodeFile) -> None:
+    """Raise a SettingsError unless the frames are of the size that the VQ-VAE reads."""
+    for source in sources:
+        if source.image_size != model.config.image_size:
+            raise SettingsError(
+                f"{source.path} has frames of {source.image_size} pixels, vqvae.image_size is "
+                f"{model.config.image_size}: collect the episodes at that size, or set it"
+            )
 
 
 def _read(path: Path, made_from: dict[str, str]) -> CodeCache:

@@ -22,24 +22,34 @@ class VQVAEConfig:
 
     Attributes:
         image_size: side of the square frame in pixels.
-        ratio: pixels along the side of a code's square; a power of two.
-        channels: width of the convolutions.
-        blocks: residual blocks of the encoder, and of the decoder.
+        encoder: `conv` (MAGE) or `dinov2` (MAGE-DINO: its features, frozen, are what becomes codes, and the decoder of
+            TextOCVP-DINO draws them).
+        ratio: pixels along the side of a code's square; a power of two (`conv` only).
+        channels: width of the convolutions; with `dinov2` of the decoder's first, a multiple of 32.
+        blocks: residual blocks of the encoder, and of the decoder (`conv` only).
+        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
+        encoder_dim, encoder_patch: width of its features, and side of its patches in pixels.
+        encoder_fingerprint: of its weights, set when they are first used; other weights are then an error.
         codebook_size: how many codes there are.
         code_dim: numbers a code.
     """
 
     image_size: int = 64
+    encoder: Literal["conv", "dinov2"] = "conv"
     ratio: int = 4
     channels: int = 256
     blocks: int = 2
     codebook_size: int = 512
     code_dim: int = 256
+    encoder_weights: str = ""
+    encoder_dim: int = 768
+    encoder_patch: int = 14
+    encoder_fingerprint: str = ""
 
     @property
     def grid(self) -> int:
         """Codes along a side of a frame."""
-        return self.image_size // self.ratio
+        return self.image_size // (self.ratio if self.encoder == "conv" else self.encoder_patch)
 
 
 @dataclass(frozen=True)
@@ -128,6 +138,10 @@ MAGE_PRESETS: dict[str, MageConfig] = {
         vqvae=VQVAEConfig(channels=64, code_dim=64),
         text=TextConfig(kind="lexicon"),
         axial=AxialConfig(dim=128, heads=4, hidden=256, frames=25, patch=2),
+    ),
+    # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).
+    "mage-dino": MageConfig(
+        name="mage-dino", vqvae=VQVAEConfig(image_size=336, encoder="dinov2", channels=1024)
     ),
 }
 

@@ -22,7 +22,6 @@ class Mage(nn.Module):
     """Frames to codes, codes and text to the codes to come, codes to frames ("Make It Move", CVPR 2022, figure 2).
 
     Attributes:
-        config: every choice of architecture.
         vqvae: frames to codes and back.
         text: sentences to tokens.
         axial: codes and tokens to scores of the next codes.
@@ -38,15 +37,29 @@ class Mage(nn.Module):
         super().__init__()
         self.vqvae = VQVAE(config.vqvae)
         self.text = build_text(config.text, text_files)
-        self.config = replace(config, text=self.text.config)  # says which frozen weights these are
+        self._config = config
         self.axial = AxialTransformer(
-            config.axial, config.vqvae.grid, config.vqvae.codebook_size, config.text.dim
+            config.axial,
+            config.vqvae.grid,
+            config.vqvae.codebook_size,
+            config.text.dim,
         )
+
+    @property
+    def config(self) -> MageConfig:
+        """Every choice of architecture; once they are known, with the fingerprints of frozen encoders' weights."""
+        return replace(self._config, vqvae=self.vqvae.config, text=self.text.config)
 
     @property
     def device(self) -> torch.device:
         """Where the model's parameters are."""
         return self.axial.time_TC.device
+
+    @torch.no_grad()
+    def take_vqvae(self, trained: VQVAE) -> None:
+        """Take over a trained VQ-VAE of the same configuration, frozen from now on."""
+        self.vqvae.load_state_dict(trained.state_dict())
+        self.vqvae.requires_grad_(False).eval()
 
     @torch.no_grad()
     def imagine(

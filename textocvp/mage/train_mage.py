@@ -24,7 +24,7 @@ from textocvp.config import with_settings
 from textocvp.episodes import EpisodeFile
 from textocvp.mage.axial import code_loss
 from textocvp.mage.checkpoint import load_vqvae
-from textocvp.mage.codes import CodeCache, cached_codes
+from textocvp.mage.codes import CodeCache, cached_codes, check_size
 from textocvp.mage.config import mage_preset
 from textocvp.mage.evaluation import Imagined, measure
 from textocvp.mage.model import Mage
@@ -89,6 +89,7 @@ def train(args: MageTraining) -> Imagined | None:
     model = assemble(args).to(accelerator.device)
     run, figures = Run(args, accelerator, Dynamics(model)), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        check_size(model.vqvae, episodes, held_out)
         with accelerator.main_process_first():
             cache = cached_codes(model.vqvae, episodes, args.out / "codes-train.h5")
         words = model.text.lookup(episodes.instructions)
@@ -133,8 +134,7 @@ def assemble(args: MageTraining) -> Mage:
     vqvae = load_vqvae(args.vqvae)
     config = replace(with_settings(mage_preset(args.preset), args.set), vqvae=vqvae.config)
     model = Mage(config)
-    model.vqvae.load_state_dict(vqvae.state_dict())
-    model.vqvae.requires_grad_(False).eval()
+    model.take_vqvae(vqvae)
     return model
 
 

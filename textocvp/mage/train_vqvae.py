@@ -10,25 +10,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import torch
+from accelerate import Accelerator
 from torch import Tensor
 from tqdm import tqdm
 
 from textocvp.config import with_settings
+from textocvp.dino import DinoEncoder
 from textocvp.episodes import EpisodeFile
+from textocvp.feature_cache import FeatureCache, encode_share
 from textocvp.loading import read_ahead
 from textocvp.losses import thing_weights
 from textocvp.mage.checkpoint import save_vqvae
+from textocvp.mage.codes import check_size
 from textocvp.mage.config import mage_preset
 from textocvp.mage.vqvae import VQVAE, perplexity
 from textocvp.metrics import psnr
 from textocvp.parser import to_frames
-from textocvp.training import Run, TrainingSettings, finish, start, step_rng
+from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
 
 
 @dataclass(kw_only=True)
@@ -56,6 +60,8 @@ class VQVAETraining(TrainingSettings):
     """Updates after which codes that none of them used are put where the features are."""
     restart_until: float = 0.7
     """Share of the updates after which codes are left where they are."""
+    cache_features: bool = False
+    """Encode all training episodes once and read their features from disk (`vqvae.encoder=dinov2` only)."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,24 @@ class CodeUses:
         self.counts_K = state["counts_K"]
 
 
+@dataclass
+class Clips:
+    """What one update learns from.
+
+    Attributes:
+        frames_BTHW3: uint8.
+        features_BTLF: of the frozen encoder, float16, where they are cached.
+    """
+
+    frames_BTHW3: Tensor
+    features_BTLF: Tensor | None = None
+
+    def on(self, device: torch.device) -> tuple[Tensor, Tensor | None]:
+        """Frames (B, T, 3, H, W) in -1..1 and features (B, T, L, F), both float32."""
+        known = self.features_BTLF
+        return to_frames(self.frames_BTHW3, device), None if known is None else known.to(device).float()
+
+
 @dataclass(frozen=True)
 class FrameReader:
     """Reads the frames of a step, in whichever process.
@@ -102,18 +126,23 @@ class FrameReader:
         episodes: the training episodes.
         args: the stage's settings.
         rows: of the step's clips, those to read.
+        features: of the same episodes, if they are cached.
     """
 
     episodes: EpisodeFile
     args: VQVAETraining
     rows: slice
+    features: FeatureCache | None = None
 
-    def __call__(self, step: int) -> Tensor:
-        """(B, T, H, W, 3) uint8."""
+    def __call__(self, step: int) -> Clips:
         args, rng = self.args, step_rng(self.args.seed, step)
         stride = int(rng.integers(1, args.stride + 1))
-        clips = self.episodes.random_clips(rng, args.batch, (args.clip - 1) * stride + 1, self.rows)
-        return torch.from_numpy(clips[:, ::stride].copy())
+        length = (args.clip - 1) * stride + 1
+        starts = self.episodes.random_starts(rng, args.batch, length)[self.rows]
+        clips = Clips(torch.from_numpy(self.episodes.clips(starts, length)[:, ::stride].copy()))
+        if self.features is not None:
+            clips.features_BTLF = torch.from_numpy(self.features.clips(starts, length, stride))
+        return clips
 
 
 def train(args: VQVAETraining) -> Redrawn | None:
@@ -123,6 +152,8 @@ def train(args: VQVAETraining) -> Redrawn | None:
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
+        DinoWeightsError: if the weights of a frozen encoder are missing.
+        FeatureCacheError: if `out` holds features of another encoder or of other episodes.
     """
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
@@ -131,14 +162,15 @@ def train(args: VQVAETraining) -> Redrawn | None:
     accelerator.register_for_checkpointing(uses)
     run, redrawn = Run(args, accelerator, model), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        batches = read_ahead(
-            FrameReader(episodes, args, run.rows), range(run.first, args.steps), args.workers
-        )
+        check_size(model, episodes, held_out)
+        features = all_features(model.dino, episodes, args, accelerator) if args.cache_features else None
+        reader = FrameReader(episodes, args, run.rows, features)
+        batches = read_ahead(reader, range(run.first, args.steps), args.workers)
         for step, clips in zip(run.steps("vqvae"), batches, strict=True):
             if step % args.restart_every == 0 and step <= args.restart_until * args.steps:
                 # Every process looks at the same whole batch, so that all of them move the same codes alike.
-                restart_codes(model, uses, FrameReader(episodes, args, slice(None))(step), args.seed + step)
-            frames_BT3HW = to_frames(clips, run.device)
+                restart_codes(model, uses, replace(reader, rows=slice(None))(step), args.seed + step)
+            frames_BT3HW, features_BTLF = clips.on(run.device)
             weights_BT1HW = thing_weights(frames_BT3HW, args.thing_weight)
             whole = run.total(weights_BT1HW.sum())
             counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64, device=run.device)
@@ -147,8 +179,9 @@ def train(args: VQVAETraining) -> Redrawn | None:
                     frames_BT3HW[part].flatten(0, 1),
                     weights_BT1HW[part].flatten(0, 1),
                 )
+                known = () if features_BTLF is None else (features_BTLF[part].flatten(0, 1),)
                 with accelerator.autocast():
-                    drawn_N3HW, found = run.module(frames_N3HW)
+                    drawn_N3HW, found = run.module(frames_N3HW, *known)
                 image = (weights_N1HW * (drawn_N3HW - frames_N3HW).square()).sum() / (3 * whole)
                 codebook, commitment = (
                     run.share(part) * term for term in (found.codebook_loss, found.commitment_loss)
@@ -176,11 +209,29 @@ def train(args: VQVAETraining) -> Redrawn | None:
     return redrawn
 
 
+def all_features(
+    dino: DinoEncoder | None, episodes: EpisodeFile, args: VQVAETraining, accelerator: Accelerator
+) -> FeatureCache:
+    """The cached features of all training episodes, each process having encoded its share.
+
+    Raises:
+        SettingsError: if there is no frozen encoder.
+    """
+    if dino is None:
+        raise SettingsError("cache_features needs a frozen encoder: vqvae.encoder=dinov2")
+    folder, share = args.out / "features-train", (accelerator.process_index, accelerator.num_processes)
+    encode_share(dino, episodes, folder, *share, device=accelerator.device)
+    accelerator.wait_for_everyone()
+    return FeatureCache(dino, episodes, folder)
+
+
 @torch.no_grad()
-def restart_codes(model: VQVAE, uses: CodeUses, clips_BTHW3: Tensor, seed: int) -> int:
+def restart_codes(model: VQVAE, uses: CodeUses, clips: Clips, seed: int) -> int:
     """Put the unused codes onto features of these frames and begin to count anew; how many there were."""
     device = model.codebook.codes_KC.device
-    features_XC = model.features(to_frames(clips_BTHW3, device).flatten(0, 1)).flatten(0, 2)
+    frames_BT3HW, features_BTLF = clips.on(device)
+    known = () if features_BTLF is None else (features_BTLF.flatten(0, 1),)
+    features_XC = model.features(frames_BT3HW.flatten(0, 1), *known).flatten(0, 2)
     generator = torch.Generator().manual_seed(seed)
     moved = model.codebook.restart((uses.counts_K == 0).to(device), features_XC, generator)
     uses.counts_K = torch.zeros_like(uses.counts_K)

@@ -7,13 +7,15 @@ Shape suffixes: N frames, H and W pixels, h and w codes along a side, C width of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, log2
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from textocvp.dino import DINO_HUB_ID, DinoEncoder
+from textocvp.image_decoders import build_image_decoder
 from textocvp.mage.config import VQVAEConfig
 
 
@@ -96,7 +98,7 @@ class Codebook(nn.Module):
 
 
 class _Residual(nn.Module):
-    """x + conv1x1(relu(conv3x3(relu(x))))"""
+    """Adds to its input a convolution of 3 x 3 and one of 1 x 1, each after a ReLU."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -107,39 +109,95 @@ class _Residual(nn.Module):
         return x + self.mix(F.relu(self.spread(F.relu(x))))
 
 
+class DinoCodes(nn.Module):
+    """The features of a frozen DINOv2, brought to the width of a code: MAGE-DINO's encoder."""
+
+    def __init__(self, config: VQVAEConfig) -> None:
+        super().__init__()
+        self.dino = DinoEncoder(
+            config.encoder_weights or DINO_HUB_ID,
+            dim=config.encoder_dim,
+            patch=config.encoder_patch,
+            fingerprint=config.encoder_fingerprint,
+            part="vqvae",
+        )
+        self.cells = self.dino.cells(config.image_size)
+        self.project = nn.Linear(config.encoder_dim, config.code_dim)
+
+    def forward(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> Tensor:
+        """(N, C, h, w). `features_NLF` are those of the frames, where they are known already."""
+        if features_NLF is None:
+            features_NLF = self.dino(frames_N3HW)
+        return self.project(features_NLF).transpose(1, 2).unflatten(2, (self.cells, self.cells))
+
+
+def _convolutions(config: VQVAEConfig) -> tuple[nn.Module, nn.Module]:
+    """Encoder and decoder as published: strided convolutions, then residual blocks, and back."""
+    halvings = round(log2(config.ratio)) if config.ratio > 0 else 0
+    if halvings < 1 or 2**halvings != config.ratio or config.image_size % config.ratio:
+        raise ValueError(
+            f"vqvae.ratio must be a power of two of at least 2 that divides vqvae.image_size "
+            f"{config.image_size}, not {config.ratio}"
+        )
+    C = config.channels
+    down: list[nn.Module] = []
+    up: list[nn.Module] = []
+    for i in range(halvings):
+        down += [nn.Conv2d(3 if i == 0 else C, C, 4, stride=2, padding=1), nn.ReLU()]
+        up += [nn.ReLU(), nn.ConvTranspose2d(C, 3 if i == halvings - 1 else C, 4, stride=2, padding=1)]
+    encoder = nn.Sequential(
+        *down[:-1],
+        *(_Residual(C) for _ in range(config.blocks)),
+        nn.Conv2d(C, config.code_dim, 1),
+    )
+    decoder = nn.Sequential(
+        nn.Conv2d(config.code_dim, C, 3, padding=1), *(_Residual(C) for _ in range(config.blocks)), *up
+    )
+    return encoder, decoder
+
+
 class VQVAE(nn.Module):
     """Frames to codes and back.
 
     Raises:
-        ValueError: if `ratio` is no power of two of at least 2, or does not divide `image_size`.
+        ValueError: if `ratio` is no power of two of at least 2, or it or DINOv2's patches do not divide `image_size`.
     """
 
     def __init__(self, config: VQVAEConfig) -> None:
         super().__init__()
-        self.config = config
-        halvings = round(log2(config.ratio)) if config.ratio > 0 else 0
-        if halvings < 1 or 2**halvings != config.ratio or config.image_size % config.ratio:
-            raise ValueError(
-                f"vqvae.ratio must be a power of two of at least 2 that divides vqvae.image_size "
-                f"{config.image_size}, not {config.ratio}"
-            )
-        C = config.channels
-        down: list[nn.Module] = []
-        up: list[nn.Module] = []
-        for i in range(halvings):
-            down += [nn.Conv2d(3 if i == 0 else C, C, 4, stride=2, padding=1), nn.ReLU()]
-            up += [nn.ReLU(), nn.ConvTranspose2d(C, 3 if i == halvings - 1 else C, 4, stride=2, padding=1)]
-        self.encoder = nn.Sequential(
-            *down[:-1], *(_Residual(C) for _ in range(config.blocks)), nn.Conv2d(C, config.code_dim, 1)
-        )
+        self._config = config
+        if config.encoder == "conv":
+            self.encoder, self.decoder = _convolutions(config)
+        else:
+            self.encoder = DinoCodes(config)
+            self.decoder = build_image_decoder("cnn", config.code_dim, config.channels, config.image_size)
         self.codebook = Codebook(config.codebook_size, config.code_dim)
-        self.decoder = nn.Sequential(
-            nn.Conv2d(config.code_dim, C, 3, padding=1), *(_Residual(C) for _ in range(config.blocks)), *up
+
+    @property
+    def config(self) -> VQVAEConfig:
+        """What it was built from; once they are known, with the fingerprint of the frozen encoder's weights."""
+        return (
+            self._config
+            if self.dino is None
+            else replace(self._config, encoder_fingerprint=self.dino.fingerprint)
         )
 
-    def features(self, frames_N3HW: Tensor) -> Tensor:
-        """What the encoder says of frames in -1..1, (N, h, w, C)."""
-        return self.encoder(frames_N3HW).permute(0, 2, 3, 1)
+    @property
+    def dino(self) -> DinoEncoder | None:
+        """The frozen encoder of MAGE-DINO."""
+        return self.encoder.dino if isinstance(self.encoder, DinoCodes) else None
+
+    def features(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> Tensor:
+        """What the encoder says of frames in -1..1, (N, h, w, C).
+
+        Args:
+            features_NLF: of the frozen encoder, where they are known already.
+
+        Raises:
+            DinoWeightsError: if the weights of the frozen encoder are missing.
+        """
+        known = () if features_NLF is None else (features_NLF,)
+        return self.encoder(frames_N3HW, *known).permute(0, 2, 3, 1)
 
     def encode(self, frames_N3HW: Tensor) -> Tensor:
         """Frames in -1..1 to the numbers (N, h, w) of their codes."""
@@ -153,9 +211,9 @@ class VQVAE(nn.Module):
         """Codes (N, h, w, C) to frames (N, 3, H, W)."""
         return self.decoder(vectors_NhwC.permute(0, 3, 1, 2)).float()
 
-    def forward(self, frames_N3HW: Tensor) -> tuple[Tensor, Quantized]:
-        """The frames (N, 3, H, W) redrawn from their codes, and what was found on the way."""
-        found = self.codebook(self.features(frames_N3HW))
+    def forward(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> tuple[Tensor, Quantized]:
+        """The frames (N, 3, H, W) redrawn from their codes, and what was found on the way. Arguments as `features`."""
+        found = self.codebook(self.features(frames_N3HW, features_NLF))
         return self.draw(found.vectors_NhwC), found
 
 
