@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -24,6 +25,11 @@ class _Steps(Dataset):
         return self.read(self.steps[index])
 
 
+def _outlive_the_signal(worker: int) -> None:
+    # Clusters send SIGTERM to whole groups of processes, and the training process still finishes its update.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
 def _as_read(batch: Batch) -> Batch:
     return batch
 
@@ -42,5 +48,6 @@ def read_ahead(read: Callable[[int], Batch], steps: range, workers: int) -> Iter
         batch_size=None,
         collate_fn=_as_read,
         num_workers=workers,
+        worker_init_fn=_outlive_the_signal,
         generator=torch.Generator(),  # else it would draw from PyTorch's own, and so change what follows
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -116,6 +117,20 @@ def test_workers_read_the_steps_in_their_order(folder: Path) -> None:
             for a, b in zip(read, expected, strict=True):
                 assert torch.equal(a.frames_BTHW3, b.frames_BTHW3) and torch.equal(a.seeds_B, b.seeds_B)
     assert not torch.equal(expected[0].frames_BTHW3, expected[1].frames_BTHW3)
+
+
+def test_workers_outlive_the_signal_that_ends_a_run(folder: Path) -> None:
+    """A cluster sends it to whole process groups, and without workers the last update could not be finished."""
+    args = parser_run(folder, "out")
+    with EpisodeFile(args.data) as episodes:
+        batches = iter(read_ahead(ClipReader(episodes, args, slice(None)), range(40), 1))
+        next(batches)
+        (worker,) = multiprocessing.active_children()
+        os.kill(worker.pid, signal.SIGTERM)
+        worker.join(timeout=1)
+        assert worker.is_alive() and len(list(batches)) == 39
+        worker.join(timeout=30)
+        assert not worker.is_alive()
 
 
 def test_shares_of_the_clips_are_the_clips(folder: Path) -> None:
