@@ -56,9 +56,11 @@ class FilmPicture:
             masks.append(paint(labels_THW, colors))
         kind = "best" if self.best else "worst"
         tone = "plain" if self.good is None else "good" if self.good else "bad"
+        # Drawn frames of many models are noisy and do not pack well; the page enlarges them itself.
+        scale = 2 if len(films) < 3 else 1
         return Clip(
             name=f"{self.group}-{kind}-{self.rank}.gif",
-            gif=gif([[happened.frames, *(as_pictures(one.frames) for one in films)], masks]),
+            gif=gif([[happened.frames, *(as_pictures(one.frames) for one in films)], masks], scale=scale),
             panels=("real", *(one.method for one in films)),
             title=happened.text,
             caption=f"{self.caption}; seed {self.scene.seed}",
