@@ -18,10 +18,10 @@ from experiments.protocol.robustness import (
     drop_difference,
     imagined_columns,
 )
-from experiments.protocol.robustness_report import BARS, percent, verdict
+from experiments.protocol.robustness_report import BARS, bars_table, doubt, percent, verdict
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import Worker
-from experiments.reporting import Checkpoint, Results
+from experiments.reporting import Checkpoint, Results, Row
 from experiments.robustness import Args, Sizes, choose_films, headline, main
 from tests.experiments.oracle import LoadOracle
 from tests.experiments.test_films import STILL, LoadStill
@@ -123,6 +123,18 @@ def test_bars_are_passed_missed_or_undecided() -> None:
     assert verdict(drop, results(lpips_drop_unseen_colors=0.2)) == "undecided: no MAGE"
     assert verdict(drop, results()) == "undecided: no LPIPS"
     assert percent(-0.064) == "-6.4 %" and percent(-0.0) == "0.0 %"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"), [(0.7, 0.9, "within the interval"), (0.76, 0.9, ""), (0.5, 0.7, "")]
+)
+def test_a_verdict_that_the_interval_leaves_open_says_so(low: float, high: float, said: str) -> None:
+    value = (low + high) / 2
+    row = Row("ours", "unseen_colors", "whole episode", "closed_loop_success", value, low, high, 8)
+    study = Results("robustness", Checkpoint("a", ""), {}, {}, False, 1.0, [row], {BARS[0].name: value})
+    assert doubt(BARS[0], study, ST_LPIPS) == said
+    cell = bars_table(study, ST_LPIPS).rows[0].cells[-1]
+    assert cell.text == verdict(BARS[0], study) and cell.interval == said
 
 
 def test_without_a_learned_distance_its_headline_is_absent() -> None:
