@@ -183,8 +183,10 @@ class Run:
         self._figures: dict[str, Tensor] = {}
         self._bar: Any = None
         # Whether to stop is agreed upon between CPUs: asking the GPUs would make them wait for it at every step.
-        several = accelerator.num_processes > 1
-        self._agreement = torch.distributed.new_group(backend="gloo", timeout=PATIENCE) if several else None
+        # `Any`: what `new_group` says it returns differs between versions of torch.
+        self._agreement: Any = None
+        if accelerator.num_processes > 1:
+            self._agreement = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
         self.first = load_state(accelerator, args.out)
 
     @property
