@@ -31,7 +31,6 @@ from experiments.protocol.ablation_scenes import (
     Entrant,
     FollowingOutcome,
     FollowingScene,
-    LoadSlots,
     ParsingOutcome,
     ParsingScene,
 )
@@ -92,7 +91,7 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
     started = time.monotonic()
     asked = load().checkpoint
     found, hashes = look(args.runs)
-    shipped = Entrant(SHIPPED, LoadSlots(args.checkpoint))
+    shipped = Entrant(SHIPPED, load)
     entrants = {
         stage: (
             shipped,
@@ -100,7 +99,7 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
         )
         for stage in ("predictor", "parser")
     }
-    counts = tuple(Entrant(slots_name(k), LoadSlots(args.checkpoint, k)) for k in slot_counts)
+    counts = tuple(Entrant(slots_name(k), load, k) for k in slot_counts)
     measures = available_measures(None, ())
     following = [
         *(
@@ -178,7 +177,7 @@ def look(runs: Path) -> tuple[list[FoundRun], dict[str, str]]:
 
 def entrant_of(found: FoundRun) -> Entrant:
     """The model of a trained run."""
-    return Entrant(found.run.name, LoadSlots(str(found.checkpoint)))
+    return Entrant(found.run.name, LoadCheckpoint(str(found.checkpoint)))
 
 
 def seeds_used(seed: int, units: Sequence[FollowingScene | ParsingScene]) -> dict[str, list[int]]:

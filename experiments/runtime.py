@@ -1,7 +1,7 @@
 """Runtime: where the time goes, what the cache saves, and how many plans a second a robot can think through.
 
     python experiments/runtime.py              # default: about 10 minutes on 2 cores
-    python experiments/runtime.py --quick      # a first look
+    python experiments/runtime.py --quick      # a first look, on all cores only
     python experiments/runtime.py --checkpoint runs/polish/checkpoint
 
 Milliseconds for 1, 9 and 24 imagined frames, for one scene and for 16, encode, predict and decode apart, on one
@@ -84,7 +84,15 @@ class Sizes:
     threads: tuple[int, ...] = tuple(sorted({1, available_cores()}))
 
 
-QUICK = Sizes(frames=(1, 9), batches=(1, 16), repeats=7, seconds=1.5, drawn=1, heavy=16)
+QUICK = Sizes(
+    frames=(1, 9),
+    batches=(1, 16),
+    repeats=7,
+    seconds=1.0,
+    drawn=1,
+    heavy=16,
+    threads=(available_cores(),),
+)
 DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, drawn=24)
 
 

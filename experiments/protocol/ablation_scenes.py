@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,42 +15,27 @@ from experiments.protocol.frame_scores import Measures, Scorer
 from experiments.protocol.object_scenes import named_block, score_masks, winners
 from experiments.protocol.predicted import imagine_and_judge
 from experiments.protocol.scenes import TestScene, draw, play
-from experiments.protocol.workers import Worker
+from experiments.protocol.workers import LoadCheckpoint, Worker
 from planning import PinholeCamera
 from textocvp.following import PIXEL, REACHED
 from textocvp.metrics import psnr
-from textocvp.world_model import WorldModel
 
 NEAR = REACHED / PIXEL  # pixels of 64
 LENGTH = 9  # frames that pictures are compared over: the paper's shorter length
 
 
 @dataclass(frozen=True)
-class LoadSlots:
-    """Loads a checkpoint and gives its parser another number of slots than it was trained with.
+class Entrant:
+    """A model that is measured.
 
     Attributes:
-        name: bundled name, folder or hub id.
-        num_slots: background included; None for its own number.
+        name: of its row. load: makes it.
+        num_slots: that its parser uses, background included; None for its own number.
     """
 
     name: str
+    load: LoadCheckpoint
     num_slots: int | None = None
-
-    def __call__(self) -> WorldModel:
-        world_model = WorldModel.from_pretrained(self.name)
-        if self.num_slots is not None:
-            parser = world_model.model.parser
-            parser.config = replace(parser.config, num_slots=self.num_slots)  # type: ignore[arg-type,type-var]
-        return world_model
-
-
-@dataclass(frozen=True)
-class Entrant:
-    """A model that is measured: its name, and what makes it."""
-
-    name: str
-    load: LoadSlots
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +151,9 @@ class ParsingScene:
         real = _film(played.frames)
         models = {}
         for entrant in self.entrants:
-            parsed = worker.other(entrant.load).parse(played.frames, seed=self.seed)
+            parsed = worker.other(entrant.load).parse(
+                played.frames, seed=self.seed, num_slots=entrant.num_slots
+            )
             scores = score_masks(winners(parsed)[0], played.segmentations, named_block(drawn))
             redrawn = float(psnr(parsed.frames[0], real).mean())
             miou, kept, ari = (float(np.nanmean(curve)) for curve in (scores.iou, scores.kept, scores.ari))

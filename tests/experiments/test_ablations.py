@@ -15,7 +15,6 @@ from experiments.protocol.ablation_runs import find_run, run_named
 from experiments.protocol.ablation_scenes import (
     Followed,
     FollowingOutcome,
-    LoadSlots,
     Parsed,
     ParsingOutcome,
 )
@@ -78,14 +77,6 @@ def test_the_page_says_what_is_missing_and_how_to_train_it(results: Path) -> Non
     assert "predictor.layers is 3, wanted 1" in page and "not finished" in page
     assert "of 123 updates" in page
     assert (results / "plots" / "following.png").is_file() and (results / "plots" / "slots.png").is_file()
-
-
-def test_another_number_of_slots_changes_the_parser_only() -> None:
-    frame = np.full((1, 64, 64, 3), 47, np.uint8)
-    frame[:, 10:20, 10:20] = (255, 87, 89)
-    assert LoadSlots("tabletop-small", 5)().parse(frame).slots.shape[2] == 5
-    assert LoadSlots("tabletop-small")().parse(frame).slots.shape[2] == 12
-    assert LoadSlots("tabletop-small", 5)().checkpoint == LoadSlots("tabletop-small")().checkpoint
 
 
 def test_rows_count_scenes() -> None:
