@@ -34,6 +34,22 @@ def goal_reached(parsed: Rollout, grounding: Grounding, goal: Goal) -> bool:
     return not open_pairs(parsed, grounding, goal)
 
 
+def contents(masks_KHW: NDArray[np.bool_], grounding: Grounding) -> dict[str, set[str]]:
+    """Which blocks are seen to lie in which bowl, in the bool masks (K, H, W) of one frame.
+
+    Returns:
+        The colour of every bowl -> the colours of the blocks in it.
+    """
+    pairs = {
+        bowl: [Instruction(block, bowl) for block in grounding.blocks if block != bowl]
+        for bowl in grounding.bowls
+    }
+    return {
+        bowl: {pair.block for pair in into if lies_in(masks_KHW, grounding, pair)}
+        for bowl, into in pairs.items()
+    }
+
+
 def lies_in(masks_KHW: NDArray[np.bool_], grounding: Grounding, pair: Instruction) -> bool:
     """Whether the pair's block is seen in its bowl, in the bool masks (K, H, W) of one frame.
 

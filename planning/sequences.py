@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.goals import Goal, Instruction
-from planning.grounding import Grounder, Grounding
+from planning.grounding import Grounder, Grounding, hard_masks
 from planning.planners import Candidate, Imagines, Plan, watched_frames
-from planning.progress import open_pairs
+from planning.progress import contents, open_pairs
 from planning.scores import CarryScore, Judge, PlacementScore, Score, Trace, WeightedSum, measure_rollout
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ class SequencePlanner:
     """Beam search over sequences of instructions.
 
     Each step is imagined from where the last imagined one ended. A step moves one of the blocks that the goal
-    names into any bowl of the scene. A sequence is worth the mean, over the goal's open pairs, of the score
+    names into any bowl of the scene in which no other block lies by then: a bowl has room for one, and a model that has
+    never seen two meet in a bowl imagines that both fit. A sequence is worth the mean, over the goal's open pairs, of the score
     of its whole imagined course.
 
     Attributes:
@@ -80,13 +81,17 @@ class SequencePlanner:
         self, branches: list[_Branch], starts: Rollout, grounding: Grounding, pairs: tuple[Instruction, ...]
     ) -> tuple[list[_Branch], Rollout]:
         """Every branch one step on, all imagined as one batch; `starts` has one row a branch."""
-        steps = [
+        possible = [
             (row, Instruction(pair.block, bowl))
             for row, branch in enumerate(branches)
             for pair in pairs
             if pair.block not in {done.block for done in branch.instructions}
             for bowl in grounding.bowls
         ]
+        masks_BKHW = hard_masks(starts.decode_masks([-1])[:, 0]).cpu().numpy()
+        inside = [contents(masks_KHW, grounding) for masks_KHW in masks_BKHW]
+        # Should no bowl have room, trying is better than giving up.
+        steps = [(row, one) for row, one in possible if inside[row][one.bowl] <= {one.block}] or possible
         texts = [instruction.text for _, instruction in steps]
         rows = [row for row, _ in steps]
         rollout = self.world_model.rollout(starts.select(rows), texts, horizon=self.horizon, seed=self.seed)

@@ -67,7 +67,28 @@ def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, camera, be
     np.testing.assert_allclose(second.slots[0, 0], first.slots[0, -1])
     assert sum(candidate.reaches_goal for candidate in plan.ranking) in (1, 2)
     if beam == 0:
-        assert len(plan.ranking) == 6 * 3 and sum(c.reaches_goal for c in plan.ranking) == 2
+        # Six first steps, and for the other block the two bowls that are then empty.
+        assert len(plan.ranking) == 6 * 2 and sum(c.reaches_goal for c in plan.ranking) == 2
+
+
+def test_a_taken_bowl_is_emptied_before_it_is_filled(oracle: OracleWorldModel, objects, camera) -> None:
+    """The oracle imagines two blocks in one bowl without trouble; the planner knows better."""
+    objects[1]["position"] = (0.60, -0.10, 0.035)  # green lies in blue
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    plan = SequencePlanner(oracle, beam=0).plan(RGB, goal, AppearanceGrounder(camera))
+    assert plan.best.instructions == (Instruction("green", "gray"), Instruction("red", "blue"))
+    assert plan.best.reaches_goal
+    for candidate in plan.ranking:
+        first, second = candidate.instructions
+        assert first != Instruction("red", "blue") and first.bowl != second.bowl
+
+
+def test_where_no_bowl_has_room_something_is_tried(oracle: OracleWorldModel, objects, camera) -> None:
+    del objects[3:]  # the blue bowl is the only one, and green lies in it
+    objects[1]["position"] = (0.60, -0.10, 0.035)
+    goal = Goal.parse("put the red block in the blue bowl")
+    plan = SequencePlanner(oracle).plan(RGB, goal, AppearanceGrounder(camera))
+    assert [candidate.instructions for candidate in plan.ranking] == [goal.pairs]
 
 
 def test_random_sequences(oracle: OracleWorldModel, camera) -> None:
