@@ -37,9 +37,9 @@ class SequencePlanner:
     """Beam search over sequences of instructions.
 
     Each step is imagined from where the last imagined one ended. A step moves one of the blocks that the goal
-    names into any bowl of the scene in which no other block lies by then: a bowl has room for one, and a model that has
-    never seen two meet in a bowl imagines that both fit. A sequence is worth the mean, over the goal's open pairs, of the score
-    of its whole imagined course.
+    names into any bowl of the scene in which no other block lies by then: a bowl has room for one, and a
+    model that has never seen two meet in a bowl imagines that both fit. A sequence is worth the mean, over
+    the goal's open pairs, of the score of its whole imagined course.
 
     Attributes:
         world_model: imagines.
