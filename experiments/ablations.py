@@ -12,7 +12,6 @@ names the command that trains it. Writes `results.json`, `report.html` and plots
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,9 +35,10 @@ from experiments.protocol.ablation_scenes import (
 )
 from experiments.protocol.arguments import StudyArgs, start
 from experiments.protocol.frame_scores import available_measures
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadCheckpoint, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgress, package_versions
+from experiments.protocol.workers import LoadCheckpoint
+from experiments.reporting import Results, StudyProgress
 from textocvp.model import CheckpointError
 
 VARIANTS = 3
@@ -85,11 +85,8 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, or a run's configuration is damaged, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    sizes = sizes or (QUICK if args.quick else DEFAULT)
     load = LoadCheckpoint(args.checkpoint)
-    started = time.monotonic()
-    asked = load().checkpoint
+    run, sizes = StudyRun.open("ablations", args, load), sizes or (QUICK if args.quick else DEFAULT)
     found, hashes = look(args.runs)
     shipped = Entrant(SHIPPED, load)
     entrants = {
@@ -120,7 +117,7 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
     ]
     followed: list[FollowingOutcome] = []
     parsed: list[ParsingOutcome] = []
-    pool = Pool(load, args.workers or available_cores())
+    pool = run.pool
     # Rough seconds of a unit on one core; they only weigh the parts in the progress bar.
     parts = {
         "predictors": (len(following), 0.6 * len(entrants["predictor"])),
@@ -140,21 +137,11 @@ def main(args: Args, sizes: Sizes | None = None, slot_counts: Sequence[int] = SL
         imagined = [FollowingScene(scene, counts, 0, args.seed) for scene in counted]
         followed += progress.track("slot counts, imagined", pool.run(imagined))
     rows = following_rows(followed) + parsing_rows(parsed)
-    results = Results(
-        study="ablations",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions=package_versions() | {f"run {name}": sha for name, sha in hashes.items()},
-        seeds=seeds_used(args.seed, [*following, *parsing, *imagined]),
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows),
-    )
-    report = build_report(results, found, slot_counts, measures, args.command("ablations"))
-    with folder.fill() as partial:
-        report.write(partial)
-    progress.print(predictor_table(rows, found), parser_table(rows, found))
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    versions = {f"run {name}": sha for name, sha in hashes.items()}
+    seeds = seeds_used(args.seed, [*following, *parsing, *imagined])
+    results = run.results(rows, headline(rows), seeds, versions)
+    run.write(build_report(results, found, slot_counts, measures, run.command))
+    run.close(progress, results, [predictor_table(rows, found), parser_table(rows, found)])
     return results
 
 

@@ -14,63 +14,46 @@ best, its motion is carried out in PyBullet, and the simulator alone judges. Wri
 from __future__ import annotations
 
 import json
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
+from experiments.protocol.arguments import StudyArgs, UsageError, start
 from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome, Method
 from experiments.protocol.controllability_report import build_report, loop_table, predicted_table
 from experiments.protocol.figures import mean_row, rate_row
 from experiments.protocol.gallery import Picture, choose_loop, choose_predicted
 from experiments.protocol.predicted import PredictedOutcome, PredictedScene
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import LONG_GOALS, LOOP_COLUMNS, LoopColumn, test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, Unit, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
-from textocvp.model import CheckpointError
+from experiments.protocol.workers import LoadWorldModel, Unit
+from experiments.reporting import Results, Row, StudyProgress
 
 VARIANTS = 3
 PREDICTED_METHODS = ("ours", "true frames", "wrong text", "copy frame")
 LOOP_METHODS: tuple[Method, ...] = ("ours", "ours, privileged", "expert", "random candidate")
 
 
-class UsageError(ValueError):
-    """Arguments that do not go together."""
-
-
 @dataclass
-class Args:
+class Args(StudyArgs):
     """Controllability study: predicted and in the closed loop."""
 
-    checkpoint: str = "tabletop-small"
-    """Bundled name, folder, or id on the Hugging Face hub."""
     out: Path = Path("results/controllability")
     """Folder for results.json, report.html, plots and clips."""
-    seed: int = 0
-    """Chooses the scenes and seeds the slots. The same seed gives the same figures."""
-    quick: bool = False
-    """A first look with few scenes, about a minute or two."""
     full: bool = False
     """100 scenes x 4 instructions x 5 slot seeds, as the paper; takes about an hour."""
-    workers: int = 0
-    """Processes; 0 for one a core. Changes no figure."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.quick and self.full:
+            raise UsageError("--quick and --full exclude each other")
 
     @property
     def sizes(self) -> Sizes:
         """How much is measured."""
         return QUICK if self.quick else FULL if self.full else DEFAULT
-
-    def __post_init__(self) -> None:
-        if self.quick and self.full:
-            raise UsageError("--quick and --full exclude each other")
-        if self.workers < 0:
-            raise UsageError(f"--workers must be at least 0, got {self.workers}")
-        if self.seed < 0:
-            raise UsageError(f"--seed must be at least 0, got {self.seed}")
 
 
 @dataclass(frozen=True)
@@ -121,12 +104,8 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    load = load or LoadCheckpoint(args.checkpoint)
-    sizes = sizes or args.sizes
-    started = time.monotonic()
-    asked = load().checkpoint
-    pool = Pool(load, args.workers or available_cores())
+    run, sizes = StudyRun.open("controllability", args, load), sizes or args.sizes
+    pool = run.pool
     slot_seeds = tuple(range(args.seed, args.seed + sizes.slot_seeds))
     scenes = test_scenes("controllability", sizes.predicted, args.seed)
     predicted_units = [PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes]
@@ -159,24 +138,12 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         progress.expect("pictures", len(imagined) + len(acted))
         units: list[Unit[Picture]] = [*imagined, *acted]
         pictures = list(progress.track("pictures", pool.run(units)))
-    results = Results(
-        study="controllability",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions=package_versions(),
-        seeds=seeds_used(slot_seeds, predicted_units, episodes),
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows),
-    )
+    results = run.results(rows, headline(rows), seeds_used(slot_seeds, predicted_units, episodes))
     shown = pictures[: len(imagined)], pictures[len(imagined) :]
-    report = build_report(results, predicted, timings(loop), *shown, command_line(args))
-    with folder.fill() as partial:
-        report.write(partial)
-        # Not in results.json, which must come out the same when a study is repeated.
-        (partial / "timings.json").write_text(json.dumps(timings(loop), indent=2) + "\n", encoding="utf-8")
-    progress.print(predicted_table(rows), loop_table(rows))
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    report = build_report(results, predicted, timings(loop), *shown, run.command)
+    # Times are not in results.json, which must come out the same when a study is repeated.
+    run.write(report, {"timings.json": json.dumps(timings(loop), indent=2) + "\n"})
+    run.close(progress, results, [predicted_table(rows), loop_table(rows)])
     return results
 
 
@@ -293,18 +260,5 @@ def timings(outcomes: Sequence[LoopOutcome]) -> dict[str, dict[str, float]]:
     return table
 
 
-def command_line(args: Args) -> str:
-    """What to type for the same figures."""
-    words = ["python experiments/controllability.py"]
-    words += ["--quick"] if args.quick else ["--full"] if args.full else []
-    words += [f"--checkpoint {args.checkpoint}"] if args.checkpoint != Args.checkpoint else []
-    return " ".join([*words, f"--seed {args.seed}"])
-
-
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except (OSError, UsageError, CheckpointError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted; nothing was written")
+    start(main, Args)

@@ -12,7 +12,6 @@ and clips into `--out`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +22,10 @@ from experiments.protocol.listening_gallery import ListeningPictures, choose_lis
 from experiments.protocol.listening_report import attends_table, build_report
 from experiments.protocol.listening_rows import COLUMNS, head_rows, headline, listening_rows
 from experiments.protocol.listening_scenes import ListeningOutcome, ListeningScene
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgress, package_versions
+from experiments.protocol.workers import LoadWorldModel
+from experiments.reporting import Results, StudyProgress
 from textocvp import WorldModel
 
 VARIANTS = 3
@@ -81,14 +81,11 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         CheckpointError: if there is no such checkpoint, before any work is done.
         UsageError: if the checkpoint hears no text.
     """
-    folder = OutputFolder(args.out)
-    load = load or LoadCheckpoint(args.checkpoint)
-    sizes = sizes or args.sizes
-    started = time.monotonic()
-    model = load()
+    run, sizes = StudyRun.open("interpretability", args, load), sizes or args.sizes
+    model = run.world_model
     if isinstance(model, WorldModel) and not model.model.predictor.hears_text:
         raise UsageError(f"{args.checkpoint} hears no text, so there is no attention to read")
-    pool = Pool(load, args.workers or available_cores())
+    pool = run.pool
     splits = dict.fromkeys(split for split, _ in COLUMNS.values())
     units = [
         ListeningScene(scene, VARIANTS if split == VARIED else 0, args.seed)
@@ -106,21 +103,9 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         chosen = choose_listening(outcomes, VARIANTS, args.seed, sizes.clips)
         pictures: list[ListeningPictures] = list(progress.track("pictures", pool.run(chosen)))
     rows = [*listening_rows(outcomes), *head_rows(outcomes, VARIED)]
-    results = Results(
-        study="interpretability",
-        checkpoint=Checkpoint(model.checkpoint.name, model.checkpoint.sha256),
-        versions=package_versions(),
-        seeds=seeds_used(args.seed, units),
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows),
-    )
-    report = build_report(results, outcomes, pictures, VARIED, args.command("interpretability"))
-    with folder.fill() as partial:
-        report.write(partial)
-    progress.print(*(attends_table(rows, role) for role in ROLES))
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    results = run.results(rows, headline(rows), seeds_used(args.seed, units))
+    run.write(build_report(results, outcomes, pictures, VARIED, run.command))
+    run.close(progress, results, [attends_table(rows, role) for role in ROLES])
     return results
 
 

@@ -14,7 +14,6 @@ Writes `results.json`, `timings.json`, `report.html`, plots and clips into `--ou
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +34,9 @@ from experiments.protocol.long_goals import (
     long_scenes,
 )
 from experiments.protocol.long_horizon_report import build_report, goals_table, success_table
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
+from experiments.protocol.running import StudyRun
+from experiments.protocol.workers import LoadWorldModel
+from experiments.reporting import Results, Row, StudyProgress
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,8 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    load = load or LoadCheckpoint(args.checkpoint)
-    sizes = sizes or args.sizes
-    started = time.monotonic()
-    asked = load().checkpoint
-    pool = Pool(load, args.workers or available_cores())
+    run, sizes = StudyRun.open("long_horizon", args, load), sizes or args.sizes
+    pool = run.pool
     episodes = {column.name: column_episodes(column, sizes, args.seed) for column in LONG_COLUMNS}
     outcomes: list[LongOutcome] = []
     # Rough seconds of an episode on one core; they only weigh the columns in the progress bar.
@@ -118,24 +114,14 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         chosen = choose_long(outcomes, sizes.clips)
         progress.expect("pictures", len(chosen))
         pictures = list(progress.track("pictures", pool.run(chosen)))
-    results = Results(
-        study="long_horizon",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions=package_versions(),
-        seeds=seeds_used(episodes, args.seed),
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows),
+    results = run.results(rows, headline(rows), seeds_used(episodes, args.seed))
+    seconds = planning_seconds(outcomes)
+    # Times are not in results.json, which must come out the same when a study is repeated.
+    run.write(
+        build_report(results, seconds, pictures, run.command),
+        {"timings.json": json.dumps(seconds, indent=2) + "\n"},
     )
-    report = build_report(results, planning_seconds(outcomes), pictures, args.command("long_horizon"))
-    with folder.fill() as partial:
-        report.write(partial)
-        # Not in results.json, which must come out the same when a study is repeated.
-        text = json.dumps(planning_seconds(outcomes), indent=2) + "\n"
-        (partial / "timings.json").write_text(text, encoding="utf-8")
-    progress.print(success_table(rows), goals_table(rows))
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    run.close(progress, results, [success_table(rows), goals_table(rows)])
     return results
 
 

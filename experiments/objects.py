@@ -12,7 +12,6 @@ most objects stand still, everything is measured once more on the named block an
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,9 +34,10 @@ from experiments.protocol.object_report import (
     mean_to,
 )
 from experiments.protocol.object_scenes import LENGTHS, MaskScores, ObjectOutcome, ObjectScene
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
+from experiments.protocol.workers import LoadWorldModel
+from experiments.reporting import Results, Row, StudyProgress
 
 
 @dataclass
@@ -110,15 +110,11 @@ def main(
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    load = load or LoadCheckpoint(args.checkpoint)
-    sizes = sizes or args.sizes
-    started = time.monotonic()
-    asked = load().checkpoint
+    run, sizes = StudyRun.open("objects", args, load), sizes or args.sizes
     absent: list[Absent] = []
     if others is None:
         others, absent = args.others()
-    pool = Pool(load, args.workers or available_cores())
+    pool = run.pool
     named = tuple(others.items())
     units = [ObjectScene(scene, args.seed, named) for scene in test_scenes(SPLIT, sizes.scenes, args.seed)]
     parts = {"scenes": len(units), "pictures": 2 * min(sizes.clips, len(units))}
@@ -131,24 +127,14 @@ def main(
         chosen = choose_objects(outcomes, args.seed, sizes.clips, sizes.apart)
         pictures: list[ObjectPictures] = list(progress.track("pictures", pool.run(chosen)))
     rows = [*method_rows(outcomes, list(METRICS)), *difference_rows(outcomes)]
-    results = Results(
-        study="objects",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions=package_versions(),
-        seeds={"slots": [args.seed], f"scenes, {SPLIT}": [unit.scene.seed for unit in units]},
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows),
-    )
-    report = build_report(results, outcomes, pictures, absent, args.command("objects"))
-    with folder.fill() as partial:
-        report.write(partial)
-    progress.print(
+    seeds = {"slots": [args.seed], f"scenes, {SPLIT}": [unit.scene.seed for unit in units]}
+    results = run.results(rows, headline(rows), seeds)
+    run.write(build_report(results, outcomes, pictures, absent, run.command))
+    tables = [
         iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True, single=False),
         iou_table(rows, "iou_moving", "Mask IoU, named block and arm", single=False),
-    )
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    ]
+    run.close(progress, results, tables)
     return results
 
 

@@ -12,13 +12,12 @@ are absent with the reason. Writes `results.json`, `report.html`, plots and clip
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.contenders import FAR, Contender, LoadVideo, LoadVideoModel, find_contenders
+from experiments.protocol.contenders import FAR, Contender, LoadVideo, LoadVideoModel, find_contenders, hashes
 from experiments.protocol.film_gallery import FilmPicture, extremes
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.prediction import (
@@ -31,9 +30,10 @@ from experiments.protocol.prediction import (
     length_rows,
 )
 from experiments.protocol.prediction_report import build_report, episode_table, paper_table, upper_table
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
+from experiments.protocol.workers import LoadWorldModel
+from experiments.reporting import Results, Row, StudyProgress
 from textocvp.jedi import VJEPA
 
 # Who is in the headline figures, by the ending of their names.
@@ -116,16 +116,13 @@ def main(
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    load, sizes = load or LoadCheckpoint(args.checkpoint), sizes or args.sizes
-    started = time.monotonic()
-    asked = load().checkpoint
+    run, sizes = StudyRun.open("prediction", args, load), sizes or args.sizes
     named = {FAR.method: args.far, "OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
     loads = {method: LoadVideo(name) for method, name in named.items()} if baselines is None else baselines
     contenders, absent = find_contenders(loads)
     if measures is None:
         measures = available_measures(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out")
-    pool = Pool(load, args.workers or available_cores())
+    pool = run.pool
     units = [
         PredictionScene(scene, tuple(contenders), measures, args.seed)
         for scene in test_scenes(SPLIT, sizes.scenes, args.seed)
@@ -140,29 +137,13 @@ def main(
         rows = [*length_rows(outcomes), *jedi_rows(outcomes), *frame_rows(outcomes, measures.metrics)]
         pictures = choose(outcomes, contenders, measures, args.seed, sizes.clips)
         clips = list(progress.track("pictures", pool.run(pictures)))
-    results = Results(
-        study="prediction",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions={**package_versions(), **{f"checkpoint of {c.method}": c.sha256 for c in contenders}},
-        seeds={"slots": [args.seed], "scenes": [unit.scene.seed for unit in units]},
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows, measures),
-    )
+    seeds = {"slots": [args.seed], "scenes": [unit.scene.seed for unit in units]}
+    results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
     best = len(clips) // 2
-    report = build_report(
-        results, contenders, absent, measures, clips[:best], clips[best:], args.command("prediction")
-    )
-    with folder.fill() as partial:
-        report.write(partial)
-    progress.print(
-        paper_table(rows, absent), episode_table(rows, absent), upper_table(rows, absent, measures)
-    )
-    for one in absent:
-        progress.console.print(f"{one.method} is absent: {one.reason}", markup=False, highlight=False)
-    progress.console.print(measures.absent, markup=False, highlight=False)
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    report = build_report(results, contenders, absent, measures, clips[:best], clips[best:], run.command)
+    run.write(report)
+    tables = [paper_table(rows, absent), episode_table(rows, absent), upper_table(rows, absent, measures)]
+    run.close(progress, results, tables, [*(one.text for one in absent), measures.absent])
     return results
 
 

@@ -12,14 +12,13 @@ and clips into `--out`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.protocol.arguments import StudyArgs, UsageError, start
 from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome
-from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel, find_contenders
+from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel, find_contenders, hashes
 from experiments.protocol.film_gallery import FilmPicture, extremes
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.gallery import choose_loop
@@ -37,9 +36,10 @@ from experiments.protocol.robustness import (
     rows_of,
 )
 from experiments.protocol.robustness_report import bars_table, build_report, frame_table, mask_table
+from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, Row, StudyProgress, package_versions
+from experiments.protocol.workers import LoadWorldModel
+from experiments.reporting import Results, Row, StudyProgress
 
 # Rough seconds of one unit on one core; they only weigh the parts in the progress bar.
 SECONDS = {"frames and masks": 4.0, "closed loop": 0.8, "films": 2.0, "robot's films": 1.5}
@@ -119,15 +119,12 @@ def main(
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    load, sizes = load or LoadCheckpoint(args.checkpoint), sizes or args.sizes
-    started = time.monotonic()
-    asked = load().checkpoint
+    run, sizes = StudyRun.open("robustness", args, load), sizes or args.sizes
     named = {"OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
     loads = {method: LoadVideo(name) for method, name in named.items()} if baselines is None else baselines
     contenders, absent = find_contenders(loads)
     measures = measures or available_measures(None, ())
-    pool = Pool(load, args.workers or available_cores())
+    pool = run.pool
     scenes = [
         RobustScene(scene, tuple(contenders), measures, args.seed)
         for split in SPLITS
@@ -170,29 +167,18 @@ def main(
         progress.expect("robot's films", len(robot))
         clips = list(progress.track("films", pool.run(films)))
         pictures = list(progress.track("robot's films", pool.run(robot)))
-    results = Results(
-        study="robustness",
-        checkpoint=Checkpoint(asked.name, asked.sha256),
-        versions={**package_versions(), **{f"checkpoint of {c.method}": c.sha256 for c in contenders}},
-        seeds={"slots": [args.seed], **_seeds(scenes, episodes)},
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows, measures),
-    )
+    seeds = {"slots": [args.seed], **_seeds(scenes, episodes)}
+    results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
     half = len(clips) // 2
-    report = build_report(
-        results, absent, measures, clips[:half], clips[half:], pictures, args.command("robustness")
-    )
-    with folder.fill() as partial:
-        report.write(partial)
-    for split in SPLITS:
-        progress.print(frame_table(rows, split, absent, measures), mask_table(rows, split, absent))
-    progress.print(bars_table(results, measures))
-    for one in absent:
-        progress.console.print(f"{one.method} is absent: {one.reason}", markup=False, highlight=False)
-    progress.console.print(measures.absent, markup=False, highlight=False)
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    report = build_report(results, absent, measures, clips[:half], clips[half:], pictures, run.command)
+    run.write(report)
+    tables = [
+        table
+        for split in SPLITS
+        for table in (frame_table(rows, split, absent, measures), mask_table(rows, split, absent))
+    ]
+    remarks = [*(one.text for one in absent), measures.absent]
+    run.close(progress, results, [*tables, bars_table(results, measures)], remarks)
     return results
 
 

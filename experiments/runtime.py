@@ -13,7 +13,6 @@ machines. Writes `results.json`, `report.html` and a plot into `--out`.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -23,6 +22,7 @@ import torch
 
 from experiments.protocol.arguments import StudyArgs, start
 from experiments.protocol.contenders import BASELINES, Absent, LoadVideo, find_contenders
+from experiments.protocol.running import StudyRun
 from experiments.protocol.runtime_report import build_report, phase_table, ratio_table
 from experiments.protocol.runtime_rows import (
     OURS,
@@ -51,8 +51,8 @@ from experiments.protocol.runtime_subjects import (
 )
 from experiments.protocol.scenes import draw, test_scenes
 from experiments.protocol.timing import machine_in_words, other_load, race
-from experiments.protocol.workers import available_cores
-from experiments.reporting import Checkpoint, OutputFolder, Results, StudyProgress, package_versions
+from experiments.protocol.workers import LoadCheckpoint, available_cores
+from experiments.reporting import Results, StudyProgress
 from planning import AppearanceGrounder, Instruction, PinholeCamera
 from textocvp.mage.video import MageVideoModel
 from textocvp.world_model import WorldModel
@@ -122,10 +122,9 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    folder = OutputFolder(args.out)
-    sizes = sizes or (QUICK if args.quick else DEFAULT)
-    world_model = WorldModel.from_pretrained(args.checkpoint)
-    started, busy = time.monotonic(), other_load()
+    load = LoadCheckpoint(args.checkpoint)
+    run, sizes = StudyRun.open("runtime", args, load), sizes or (QUICK if args.quick else DEFAULT)
+    world_model, busy = load(), other_load()
     scenes = look(args.seed, max(sizes.batches))
     subjects, absent = all_subjects(world_model, scenes, sizes.drawn if paper else 0)
     threads = sizes.threads
@@ -152,25 +151,14 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
     finally:
         torch.set_num_threads(before)
     rows = cell_rows(seconds) + query_rows(queries) + ratio_rows(seconds, queries)
-    results = Results(
-        study="runtime",
-        checkpoint=Checkpoint(world_model.checkpoint.name, world_model.checkpoint.sha256),
-        versions=package_versions() | {"machine": machine_in_words()},
-        seeds={
-            "study": [args.seed],
-            "scenes": [s.seed for s in test_scenes("test", len(scenes.texts), args.seed)],
-        },
-        quick=args.quick,
-        seconds=round(time.monotonic() - started, 1),
-        rows=rows,
-        headline=headline(rows, max(threads)),
-    )
+    seeds = {
+        "study": [args.seed],
+        "scenes": [scene.seed for scene in test_scenes("test", len(scenes.texts), args.seed)],
+    }
+    results = run.results(rows, headline(rows, max(threads)), seeds, {"machine": machine_in_words()})
     notes = {subject.name: subject.note for subject in subjects}
-    report = build_report(results, notes, absent, sizes.drawn, busy, args.command("runtime"))
-    with folder.fill() as partial:
-        report.write(partial)
-    progress.print(phase_table(rows, max(threads), 1, sizes.frames), ratio_table(rows))
-    progress.console.print(f"{results.seconds:.0f} s. Report: {folder.path / 'report.html'}")
+    run.write(build_report(results, notes, absent, sizes.drawn, busy, run.command))
+    run.close(progress, results, [phase_table(rows, max(threads), 1, sizes.frames), ratio_table(rows)])
     return results
 
 

@@ -117,6 +117,11 @@ class Absent:
     method: str
     reason: str
 
+    @property
+    def text(self) -> str:
+        """Both, as a sentence."""
+        return f"{self.method} is absent: {self.reason}"
+
 
 def find_contenders(
     loads: Mapping[str, LoadVideoModel],
@@ -146,6 +151,11 @@ def find_contenders(
             Contender(baseline.method, load, baseline.slots, where.name, where.sha256, model.longest_horizon)
         )
     return present, absent
+
+
+def hashes(contenders: Sequence[Contender]) -> dict[str, str]:
+    """The SHA-256 of every contender's weights, as `results.json` names them."""
+    return {f"checkpoint of {contender.method}": contender.sha256 for contender in contenders}
 
 
 def absent_text(absent: Sequence[Absent]) -> str:
