@@ -144,7 +144,7 @@ class AppearanceGrounder:
 def hard_masks(masks_NKHW: Tensor) -> Tensor:
     """Soft masks (..., K, H, W) -> bool masks: each pixel belongs to the slot with the largest share."""
     winner_N1HW = masks_NKHW.argmax(-3, keepdim=True)
-    slots_K11 = torch.arange(masks_NKHW.shape[-3])[:, None, None]
+    slots_K11 = torch.arange(masks_NKHW.shape[-3], device=masks_NKHW.device)[:, None, None]
     return winner_N1HW == slots_K11
 
 

@@ -154,8 +154,8 @@ def _train(arguments: list[str]) -> None:
         if chosen.preset is not None:
             of_mage = isinstance(chosen, (train_vqvae.VQVAETraining, train_mage.MageTraining))
             with_settings((mage_preset if of_mage else preset)(chosen.preset), chosen.set)
-        for path in (chosen.data, chosen.val):
-            EpisodeFile(path).close()
+        EpisodeFile(chosen.data, first=chosen.episodes).close()
+        EpisodeFile(chosen.val).close()
     except KeyError as error:
         raise Mistake(error.args[0]) from error
     except (OSError, ValueError) as error:
@@ -187,7 +187,13 @@ def _rollout(command: RolloutCommand) -> None:
         raise Mistake(f"there is no picture {command.image}") from None
     except (UnidentifiedImageError, OSError) as error:
         raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
-    world_model = WorldModel.from_pretrained(command.checkpoint, command.device)
+    try:
+        world_model = WorldModel.from_pretrained(command.checkpoint, command.device)
+    except (
+        RuntimeError,
+        AssertionError,
+    ) as error:  # what torch says of a device that it does not know or have
+        raise Mistake(f"--device {command.device} cannot be used: {error}") from error
     H, W = world_model.image_size
     if command.resize:
         picture = picture.resize((W, H), Image.Resampling.BOX)

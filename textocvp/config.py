@@ -171,6 +171,8 @@ class ModelConfig:
     Attributes:
         name: the preset it came from.
         parser, renderer, text, predictor: its four parts.
+        stage: the last stage of training that a checkpoint has been through. After `parser`, text encoder and predictor
+            are still as they were drawn.
     """
 
     name: str
@@ -178,6 +180,7 @@ class ModelConfig:
     renderer: RendererConfig = field(default_factory=RendererConfig)
     text: TextConfig = field(default_factory=TextConfig)
     predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    stage: Literal["parser", "predictor"] = "predictor"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, ready for JSON."""

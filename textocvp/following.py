@@ -6,8 +6,7 @@ trained on it, and the planner grounds slots by their looks (`planning`)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from textocvp.model import TextOCVP, evaluating
 from textocvp.slots import SlotLayout, SlotState, pixel_grid
 
 if TYPE_CHECKING:
     from textocvp.episodes import Episode, EpisodeFile
-    from textocvp.model import TextOCVP
     from textocvp.slot_cache import SlotCache
 
 PIXEL = 2 / 64  # the thresholds are for 64x64 frames; in -1..1
@@ -207,7 +206,7 @@ class FollowingTest:
         for at in range(0, len(episodes), self.batch):
             chosen = list(episodes[at : at + self.batch])
             seed = self.slots_ETKD[chosen, :1].to(model.device)
-            with _evaluating(model):
+            with evaluating(model):
                 text = model.text(sentences[at : at + self.batch])
                 imagined = model.predictor.rollout(seed, text, steps)
             last = SlotState.split(imagined.slots_BSKD[:, -1].float().cpu(), self.layout)
@@ -222,18 +221,6 @@ class FollowingTest:
         if block < 0 or bowl is None or bowl < 0:
             return False
         return float((ends_K2[block] - self._place(episode, 0, bowl)).norm()) < REACHED
-
-
-@contextmanager
-def _evaluating(model: TextOCVP) -> Iterator[None]:
-    """The model in evaluation mode, and afterwards each part in the mode that it was in."""
-    training = [module for module in model.modules() if module.training]
-    model.eval()
-    try:
-        yield
-    finally:
-        for module in training:
-            module.training = True
 
 
 def _share(outcomes: Iterable[bool]) -> float:

@@ -122,7 +122,7 @@ class VJepaFeatures:
         frames = films_NT3HW[:, moments].float()
         size = (config.crop_size, config.crop_size)
         flat = F.interpolate(frames.flatten(0, 1), size=size, mode="bicubic", antialias=True).clamp(0, 1)
-        mean, deviation = (torch.tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
+        mean, deviation = (flat.new_tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
         pixels = ((flat - mean) / deviation).unflatten(0, frames.shape[:2])
         probe = getattr(self.model, "pooler", None)
         encoder = self.model if probe is None else self.model.vjepa2

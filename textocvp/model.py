@@ -10,6 +10,8 @@ unpickled.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -127,6 +129,18 @@ class TextOCVP(
         return model.to(device).eval()
 
 
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """The model in evaluation mode, and afterwards each part in the mode that it was in."""
+    training = [module for module in model.modules() if module.training]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
 def checkpoint_folder(name: str | Path, **hub: Any) -> Path:
     """The folder of that name, or the one into which the repository `name` of the Hugging Face hub was fetched.
 
@@ -158,6 +172,11 @@ def read_config(folder: Path) -> ModelConfig:
             unknown or missing.
     """
     data = read_json(folder)
+    if data.get("architecture") == "mage-vqvae":
+        raise CheckpointError(
+            f"{folder} holds a VQ-VAE, which imagines nothing: `textocvp train mage --vqvae {folder}` makes a MAGE "
+            "of it"
+        )
     if "architecture" in data:
         raise CheckpointError(
             f"{folder} holds a {data['architecture']!r} model, which has no slots: load it with "

@@ -86,7 +86,9 @@ def measure_parser(
     for index in chosen:
         episode = episodes.episode(index)
         frames = to_frames(episode.frames[None], model.device)[0]
-        slots = model.parser(frames[None]).slots_BTKD[0]
+        # Where first slots are drawn, an episode's are the same whenever it is measured.
+        seeded = torch.Generator(model.device).manual_seed(index)
+        slots = model.parser(frames[None], generator=seeded).slots_BTKD[0]
         rendered = model.renderer(slots)
         drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
         psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())

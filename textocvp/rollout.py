@@ -104,7 +104,7 @@ class Rollout:
         with torch.no_grad():
             drawn = [
                 (self.renderer(chunk).object_frames_BK3HW.float() * 0.5 + 0.5).clamp(0, 1)
-                for chunk in self.slots[:, times].reshape(-1, K, D).split(CHUNK)
+                for chunk in self.slots[:, times].reshape(-1, K, D).split(max(1, CHUNK // K))
             ]
         return torch.cat(drawn).unflatten(0, (B, len(times)))
 
@@ -230,10 +230,12 @@ class Rollout:
             IndexError: if there is no such sequence.
         """
         B = len(self)
-        if isinstance(index, int):
-            keep = [range(B)[index]]
+        if isinstance(index, slice):
+            keep = list(range(B)[index])
+        elif isinstance(index, Sequence) or np.ndim(index):
+            keep = [range(B)[int(i)] for i in index]  # type: ignore[union-attr]
         else:
-            keep = list(range(B)[index]) if isinstance(index, slice) else [range(B)[int(i)] for i in index]
+            keep = [range(B)[int(index)]]
         return replace(
             self,
             slots=self.slots[keep],

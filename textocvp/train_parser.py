@@ -9,7 +9,7 @@ and the places that the transition expected with those that the corrector found.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,16 @@ from textocvp.model import TextOCVP
 from textocvp.parser import to_frames
 from textocvp.parser_quality import ParserQuality, measure_parser
 from textocvp.slots import SlotState
-from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
+from textocvp.training import (
+    Run,
+    SettingsError,
+    TrainingSettings,
+    allowed_settings,
+    check_frame_size,
+    finish,
+    start,
+    step_rng,
+)
 
 
 @dataclass(kw_only=True)
@@ -173,15 +182,18 @@ def train(args: ParserTraining) -> ParserQuality | None:
         args.out, args.precision, some_unused=args.clip == 1
     )  # the transition, on single frames
     torch.manual_seed(args.seed)
-    model = TextOCVP(with_settings(preset(args.preset), args.set)).to(accelerator.device)
+    with allowed_settings():
+        config = replace(with_settings(preset(args.preset), args.set), stage="parser")
+        model = TextOCVP(config).to(accelerator.device)
     run, quality = Run(args, accelerator, Redrawing(model)), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        for source in (episodes, held_out):
-            if source.image_size != model.config.parser.image_size:
-                raise SettingsError(
-                    f"{source.path} has frames of {source.image_size} pixels, parser.image_size is "
-                    f"{model.config.parser.image_size}: collect the episodes at that size, or set it"
-                )
+        check_frame_size(model.config.parser.image_size, "parser.image_size", episodes, held_out)
+        longest, wanted = int(episodes.lengths.max()), (args.clip - 1) * args.stride + 1
+        if wanted > longest:
+            raise SettingsError(
+                f"clip={args.clip} and stride={args.stride} need episodes of {wanted} frames, the longest of "
+                f"{args.data} has {longest}"
+            )
         features = None
         if args.cache_features:
             features = _all_features(model, episodes, args.out / "features-train", accelerator)
@@ -248,7 +260,9 @@ def draw_samples(
     for index in chosen:
         episode = episodes.episode(index)
         times = np.linspace(0, len(episode.frames) - 1, columns).round().astype(int)
-        slots = model.parser(to_frames(episode.frames[None], model.device)).slots_BTKD[0, times]
+        seeded = torch.Generator(model.device).manual_seed(index)
+        frames = to_frames(episode.frames[None], model.device)
+        slots = model.parser(frames, generator=seeded).slots_BTKD[0, times]
         rendered = model.renderer(slots)
         drawn_BHW3 = ((rendered.frames_B3HW.clamp(-1, 1) + 1) * 127.5).permute(0, 2, 3, 1)
         drawn = drawn_BHW3.cpu().numpy().astype(np.uint8)

@@ -33,7 +33,15 @@ from textocvp.predictor_data import SlotBatches, true_frames
 from textocvp.predictor_loss import slot_loss
 from textocvp.slot_cache import SlotCache, cached_slots, parse_share
 from textocvp.text import TextEncoder, WordBatch
-from textocvp.training import Run, SettingsError, TrainingSettings, finish, start
+from textocvp.training import (
+    Run,
+    SettingsError,
+    TrainingSettings,
+    allowed_settings,
+    check_frame_size,
+    finish,
+    start,
+)
 
 
 @dataclass(kw_only=True)
@@ -105,6 +113,8 @@ class Dynamics(nn.Module):
         if imagined:
             with torch.no_grad():
                 dreamt_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
+            # Under autocast some versions of torch would reuse weights that were cast without a gradient.
+            torch.clear_autocast_cache()
             seen_BTKD = torch.cat([seen_BTKD, dreamt_BSKD], dim=1)
         return self.predictor(seen_BTKD, text, forgetful_B)
 
@@ -124,6 +134,7 @@ def train(args: PredictorTraining) -> Following | None:
     torch.manual_seed(args.seed)
     model = assemble(args).to(accelerator.device)
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        check_frame_size(model.config.parser.image_size, "parser.image_size", episodes, held_out)
         for file, name in ((episodes, "train"), (held_out, "val")):
             share = (accelerator.process_index, accelerator.num_processes)
             parse_share(model, file, args.out / f"slots-{name}.h5", *share)
@@ -163,10 +174,12 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     if args.finetune:
         if args.preset is not None:
             raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
-        try:
+        if trained.config.stage == "parser":
+            raise SettingsError(f"{args.parser} has no trained predictor to finetune: leave out finetune")
+        with allowed_settings():
             grow_window(trained, args.set)
-        except ValueError as error:
-            raise SettingsError(str(error)) from error
+        trained.text.train()
+        trained.predictor.train()
         for part in (trained.parser, trained.renderer):
             part.requires_grad_(False)
         return trained
@@ -175,13 +188,15 @@ def assemble(args: PredictorTraining) -> TextOCVP:
         chosen = preset(args.preset)
         config = dataclasses.replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
     # The text encoder is new, and so are its weights if they are frozen ones.
-    config = dataclasses.replace(config, text=dataclasses.replace(config.text, fingerprint=""))
+    text = dataclasses.replace(config.text, fingerprint="")
+    config = dataclasses.replace(config, text=text, stage="predictor")
     for setting in args.set:
         if not setting.startswith(("predictor.", "text.")):
             raise SettingsError(
                 f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
             )
-    model = TextOCVP(with_settings(config, args.set))
+    with allowed_settings():
+        model = TextOCVP(with_settings(config, args.set))
     for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
         part.load_state_dict(source.state_dict())
         part.requires_grad_(False).eval()

@@ -37,6 +37,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
+from textocvp.episodes import EpisodeFile
+
 STEP_FILE = "step.json"
 LOG_EVERY = 20  # updates
 PATIENCE = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
@@ -44,6 +46,39 @@ PATIENCE = timedelta(hours=12)  # how long processes wait for one that parses or
 
 class SettingsError(ValueError):
     """Settings that exclude each other or that this machine cannot do; the message says which."""
+
+
+@contextmanager
+def allowed_settings() -> Iterator[None]:
+    """For building a model: parts that do not fit each other are the settings' fault.
+
+    Raises:
+        SettingsError: for a ValueError that is no more special than that.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if type(error) is not ValueError:
+            raise
+        raise SettingsError(str(error)) from error
+
+
+def check_frame_size(image_size: int, setting: str, *sources: EpisodeFile) -> None:
+    """Check that a model reads frames of the size that episodes have.
+
+    Args:
+        image_size: side of the frames that it reads, in pixels.
+        setting: what that is called in its configuration.
+
+    Raises:
+        SettingsError: if a file has frames of another size.
+    """
+    for source in sources:
+        if source.image_size != image_size:
+            raise SettingsError(
+                f"{source.path} has frames of {source.image_size} pixels, {setting} is {image_size}: "
+                "collect the episodes at that size, or set it"
+            )
 
 
 @dataclass

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,13 @@ class WorldModel:
 
         A word that the text encoder has never met is a `UserWarning` that names the word.
         """
+        if self.model.config.stage == "parser":
+            warnings.warn(
+                f"{self.checkpoint.name} has been through the first stage of training only: it can parse, and "
+                "what it imagines is noise",
+                UserWarning,
+                stacklevel=2,
+            )
         texts = checked_texts(text, self.model.text)
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
         checked_horizon(horizon, self.longest_horizon, hint)

@@ -20,7 +20,6 @@ from textocvp.episodes import EpisodeFile
 from textocvp.mage.vqvae import VQVAE
 from textocvp.parser import to_frames
 from textocvp.slot_cache import SlotCacheError, episodes_fingerprint
-from textocvp.training import SettingsError
 
 
 class CodeCacheError(SlotCacheError):
@@ -88,16 +87,6 @@ def cached_codes(model: VQVAE, episodes: EpisodeFile, path: Path, *, batch: int 
         file.attrs.update(made_from)
     unfinished.replace(path)  # killed at any moment, either the whole file is there or none
     return cache
-
-
-def check_size(model: VQVAE, *sources: EpisodeFile) -> None:
-    """Raise a SettingsError unless the frames are of the size that the VQ-VAE reads."""
-    for source in sources:
-        if source.image_size != model.config.image_size:
-            raise SettingsError(
-                f"{source.path} has frames of {source.image_size} pixels, vqvae.image_size is "
-                f"{model.config.image_size}: collect the episodes at that size, or set it"
-            )
 
 
 def _read(path: Path, made_from: dict[str, str]) -> CodeCache:

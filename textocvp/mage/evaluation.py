@@ -11,6 +11,7 @@ import torch
 from textocvp.episodes import EpisodeFile
 from textocvp.mage.model import Mage
 from textocvp.metrics import psnr
+from textocvp.model import evaluating
 from textocvp.parser import to_frames
 
 
@@ -53,8 +54,9 @@ def measure(model: Mage, episodes: EpisodeFile, chosen: Iterable[int], batch: in
         frames_BT3HW = to_frames(np.stack(clips), model.device)
         B, T = frames_BT3HW.shape[:2]
         true_BThw = model.vqvae.encode(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
-        text = model.text([episodes.instructions[number] for number in part])
-        imagined_BShw = model.axial.imagine(true_BThw[:, :1], text, T - 1)
+        with evaluating(model):
+            text = model.text([episodes.instructions[number] for number in part])
+            imagined_BShw = model.axial.imagine(true_BThw[:, :1], text, T - 1)
         real = (frames_BT3HW[:, 1:] + 1) / 2
         for name, codes in (
             ("psnr", imagined_BShw),

@@ -24,12 +24,21 @@ from textocvp.config import with_settings
 from textocvp.episodes import EpisodeFile
 from textocvp.mage.axial import code_loss
 from textocvp.mage.checkpoint import load_vqvae
-from textocvp.mage.codes import CodeCache, cached_codes, check_size
+from textocvp.mage.codes import CodeCache, cached_codes
 from textocvp.mage.config import mage_preset
 from textocvp.mage.evaluation import Imagined, measure
 from textocvp.mage.model import Mage
 from textocvp.text import WordBatch
-from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
+from textocvp.training import (
+    Run,
+    SettingsError,
+    TrainingSettings,
+    allowed_settings,
+    check_frame_size,
+    finish,
+    start,
+    step_rng,
+)
 
 
 @dataclass(kw_only=True)
@@ -70,6 +79,8 @@ class Dynamics(nn.Module):
         text = self.text.encode(words)
         if imagined:
             added_BShw = self.axial.imagine(seen_BThw, text, imagined, speed_B)
+            # Under autocast some versions of torch would reuse weights that were cast without a gradient.
+            torch.clear_autocast_cache()
             seen_BThw = torch.cat([seen_BThw, added_BShw], dim=1)
         return self.axial(seen_BThw, text, speed_B)
 
@@ -89,7 +100,7 @@ def train(args: MageTraining) -> Imagined | None:
     model = assemble(args).to(accelerator.device)
     run, figures = Run(args, accelerator, Dynamics(model)), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        check_size(model.vqvae, episodes, held_out)
+        check_frame_size(model.config.vqvae.image_size, "vqvae.image_size", episodes, held_out)
         with accelerator.main_process_first():
             cache = cached_codes(model.vqvae, episodes, args.out / "codes-train.h5")
         words = model.text.lookup(episodes.instructions)
@@ -133,7 +144,8 @@ def assemble(args: MageTraining) -> Mage:
             raise SettingsError(f"{setting!r}: the VQ-VAE comes trained; set text.* and axial.* only")
     vqvae = load_vqvae(args.vqvae)
     config = replace(with_settings(mage_preset(args.preset), args.set), vqvae=vqvae.config)
-    model = Mage(config)
+    with allowed_settings():
+        model = Mage(config)
     model.take_vqvae(vqvae)
     return model
 

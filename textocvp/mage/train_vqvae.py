@@ -27,12 +27,20 @@ from textocvp.feature_cache import FeatureCache, encode_share
 from textocvp.loading import read_ahead
 from textocvp.losses import thing_weights
 from textocvp.mage.checkpoint import save_vqvae
-from textocvp.mage.codes import check_size
 from textocvp.mage.config import mage_preset
 from textocvp.mage.vqvae import VQVAE, perplexity
 from textocvp.metrics import psnr
 from textocvp.parser import to_frames
-from textocvp.training import Run, SettingsError, TrainingSettings, finish, start, step_rng
+from textocvp.training import (
+    Run,
+    SettingsError,
+    TrainingSettings,
+    allowed_settings,
+    check_frame_size,
+    finish,
+    start,
+    step_rng,
+)
 
 
 @dataclass(kw_only=True)
@@ -157,12 +165,13 @@ def train(args: VQVAETraining) -> Redrawn | None:
     """
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = VQVAE(with_settings(mage_preset(args.preset), args.set).vqvae).to(accelerator.device)
+    with allowed_settings():
+        model = VQVAE(with_settings(mage_preset(args.preset), args.set).vqvae).to(accelerator.device)
     uses = CodeUses(model.config.codebook_size)
     accelerator.register_for_checkpointing(uses)
     run, redrawn = Run(args, accelerator, model), None
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        check_size(model, episodes, held_out)
+        check_frame_size(model.config.image_size, "vqvae.image_size", episodes, held_out)
         features = all_features(model.dino, episodes, args, accelerator) if args.cache_features else None
         reader = FrameReader(episodes, args, run.rows, features)
         batches = read_ahead(reader, range(run.first, args.steps), args.workers)
