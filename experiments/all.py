@@ -4,13 +4,15 @@
     python experiments/all.py --quick            # first looks, about 20 minutes
     python experiments/all.py --only runtime --only long_horizon --fresh
 
-A study whose `results.json` is there, from the same checkpoint, seed, `--quick` and other weights that it reads, is
-not run again. One that fails is told on the page, the others are run all the same, and the exit status is 1. Writes a
-folder a study into `--out`, `index.html`, and `summary.md`: tables for the README, made from the `results.json` files.
+A study that this program has run is not run again while its command line, all weights that it reads and the code of
+this repository are the same. One that fails is told on the page, the others are run all the same, and the exit status
+is 1. Writes a folder a study into `--out`, `index.html`, and `summary.md`: tables for the README, made from the
+`results.json` files.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -20,6 +22,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from rich.console import Console
@@ -32,7 +35,7 @@ from experiments.reporting.index import Entry, Index
 from experiments.reporting.summary import study_markdown
 
 RECORD = "all.json"
-"""What each study was run with, as far as its `results.json` does not say so."""
+"""What each finished study was run with."""
 SHOWN = 5  # headline figures a study on the index page
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -49,6 +52,11 @@ class Args(StudyArgs):
     """Run studies again that are done already."""
     runs: Path = Path("runs/ablations")
     """Folder of the ablation runs."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.quick and self.out == Path("quick") / "results":
+            self.out = Path("results") / "quick"
 
 
 @dataclass(frozen=True)
@@ -109,36 +117,46 @@ def _one(study: Study, args: Args, checkpoint: Checkpoint, run: Run, console: Co
         console.print(f"{study.name}: done already", highlight=False)
         return Outcome(study, "kept")
     console.rule(study.title)
-    digest = inputs_digest(study, args.runs)
-    began = time.monotonic()
+    before, began = identity(study, args), time.monotonic()
+    _record(args.out, study, None)
     problem = run(study, args)
-    if not problem and not done_already(study, args, checkpoint, digest):
+    if not problem and not complete(study, args, checkpoint):
         problem = "it ended well, but its results.json is not there or of another checkpoint"
     if problem:
         console.print(f"[red]{study.name} failed[/] after {time.monotonic() - began:.0f} s", highlight=False)
         return Outcome(study, "failed", problem)
-    _record(args.out, study, digest)
+    _record(args.out, study, before)
     return Outcome(study, "done")
 
 
-def done_already(study: Study, args: Args, checkpoint: Checkpoint, digest: str | None = None) -> bool:
-    """Whether a study's results are there, from the same checkpoint, seed, size and other weights.
+def done_already(study: Study, args: Args, checkpoint: Checkpoint) -> bool:
+    """Whether this program has run the study, and would run the very same again."""
+    return complete(study, args, checkpoint) and _records(args.out).get(study.name) == identity(study, args)
 
-    Args:
-        digest: of the other weights that it has just read; by default those of the record.
-    """
+
+def complete(study: Study, args: Args, checkpoint: Checkpoint) -> bool:
+    """Whether the results of the study are there, as they were asked for."""
     results = read_results(args.out / study.name)
     if results is None or not (args.out / study.name / "report.html").is_file():
         return False
-    # The studies seed their slots with what they were told; runtime has no slots that depend on it.
-    seeds = [*results.seeds.get("slots", ()), *results.seeds.get("study", ())]
-    same = (results.checkpoint.sha256, results.quick, seeds[:1]) == (
-        checkpoint.sha256,
-        args.quick,
-        [args.seed],
-    )
-    now = inputs_digest(study, args.runs)
-    return same and now == (_records(args.out).get(study.name, now) if digest is None else digest)
+    return (results.checkpoint.sha256, results.quick) == (checkpoint.sha256, args.quick)
+
+
+def identity(study: Study, args: Args) -> str:
+    """A hash of all that the figures of a study depend on, but for the checkpoint."""
+    options = study_options(study, replace(args, out=Path(), workers=0))
+    text = "\n".join([*options, inputs_digest(study, args.runs), code_digest()])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """A hash of the Python files that figures can depend on."""
+    digest = hashlib.sha256()
+    for room in ("envs", "experiments", "planning", "textocvp"):
+        for path in sorted((ROOT / room).rglob("*.py")):
+            digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def read_results(folder: Path) -> Results | None:
@@ -157,8 +175,10 @@ def _records(out: Path) -> dict[str, str]:
     return data if isinstance(data, dict) else {}
 
 
-def _record(out: Path, study: Study, digest: str) -> None:
-    text = json.dumps(_records(out) | {study.name: digest}, indent=2) + "\n"
+def _record(out: Path, study: Study, done: str | None) -> None:
+    """Remember what a study was run with, or, with None, that nothing is known of its results any more."""
+    records = _records(out) | {study.name: done}
+    text = json.dumps({name: value for name, value in records.items() if value}, indent=2) + "\n"
     new = out / (RECORD + ".new")
     new.write_text(text, encoding="utf-8")
     new.replace(out / RECORD)

@@ -25,7 +25,7 @@ from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome, Method
 from experiments.protocol.controllability_report import build_report, loop_table, predicted_table
 from experiments.protocol.figures import mean_row, rate_row
 from experiments.protocol.gallery import Picture, choose_loop, choose_predicted
-from experiments.protocol.predicted import PredictedOutcome, PredictedScene
+from experiments.protocol.predicted import HORIZON, PredictedOutcome, PredictedScene
 from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import LONG_GOALS, LOOP_COLUMNS, LoopColumn, test_scenes
 from experiments.protocol.workers import LoadWorldModel, Unit
@@ -104,7 +104,7 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    run, sizes = StudyRun.open("controllability", args, load), sizes or args.sizes
+    run, sizes = StudyRun.open("controllability", args, load, HORIZON), sizes or args.sizes
     pool = run.pool
     slot_seeds = tuple(range(args.seed, args.seed + sizes.slot_seeds))
     scenes = test_scenes("controllability", sizes.predicted, args.seed)

@@ -34,6 +34,7 @@ from experiments.protocol.long_goals import (
     long_scenes,
 )
 from experiments.protocol.long_horizon_report import build_report, goals_table, success_table
+from experiments.protocol.predicted import HORIZON
 from experiments.protocol.running import StudyRun
 from experiments.protocol.workers import LoadWorldModel
 from experiments.reporting import Results, Row, StudyProgress
@@ -62,7 +63,7 @@ class Sizes:
 
 
 QUICK = Sizes(one=4, two=4, three=3, taken=3, clips=2)
-DEFAULT = Sizes(one=20, two=20, three=20, taken=20, clips=6)
+DEFAULT = Sizes(one=20, two=20, three=20, taken=20, clips=10)
 FULL = Sizes(one=100, two=100, three=100, taken=100, clips=10)
 
 
@@ -98,7 +99,7 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    run, sizes = StudyRun.open("long_horizon", args, load), sizes or args.sizes
+    run, sizes = StudyRun.open("long_horizon", args, load, HORIZON), sizes or args.sizes
     pool = run.pool
     episodes = {column.name: column_episodes(column, sizes, args.seed) for column in LONG_COLUMNS}
     outcomes: list[LongOutcome] = []
@@ -153,7 +154,7 @@ def column_rows(method: LongMethod, column: LongColumn, here: Sequence[LongOutco
     place = method.name, column.split, column.name
     rows = [
         rate_row(*place, "closed_loop_success", [o.success for o in here]),
-        mean_row(*place, "subgoals_reached", [o.gained for o in here]),
+        rate_row(*place, "subgoals_reached", [o.gained for o in here]),
         mean_row(*place, "steps", [len(o.instructions) for o in here]),
     ]
     if all(o.believes_reached is not None for o in here):

@@ -128,13 +128,14 @@ def main(
         pictures: list[ObjectPictures] = list(progress.track("pictures", pool.run(chosen)))
     rows = [*method_rows(outcomes, list(METRICS)), *difference_rows(outcomes)]
     seeds = {"slots": [args.seed], f"scenes, {SPLIT}": [unit.scene.seed for unit in units]}
-    results = run.results(rows, headline(rows), seeds)
+    versions = {f"checkpoint of {method}": load().checkpoint.sha256 for method, load in named}
+    results = run.results(rows, headline(rows), seeds, versions)
     run.write(build_report(results, outcomes, pictures, absent, run.command))
     tables = [
         iou_table(rows, "iou", "Mask IoU, all blocks and bowls", paper=True, single=False),
         iou_table(rows, "iou_moving", "Mask IoU, named block and arm", single=False),
     ]
-    run.close(progress, results, tables)
+    run.close(progress, results, tables, [one.text for one in absent])
     return results
 
 
@@ -201,7 +202,7 @@ def headline(rows: Sequence[Row]) -> dict[str, float]:
         for method, name in names.items()
         for length in LENGTHS[:3]
     }
-    named = {name: round(found[key], 4) for name, key in wanted.items()}
+    named = {name: round(found[key], 4) for name, key in wanted.items() if key in found}
     for length in LENGTHS[:3]:
         key = ("OCVP-Seq", mean_to(length), "iou")
         if key in found:

@@ -22,6 +22,7 @@ from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel
 from experiments.protocol.film_gallery import FilmPicture, extremes
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.gallery import choose_loop
+from experiments.protocol.predicted import HORIZON
 from experiments.protocol.robustness import (
     LENGTHS,
     LOOP_METHODS,
@@ -119,7 +120,7 @@ def main(
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    run, sizes = StudyRun.open("robustness", args, load), sizes or args.sizes
+    run, sizes = StudyRun.open("robustness", args, load, HORIZON), sizes or args.sizes
     named = {"OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
     loads = {method: LoadVideo(name) for method, name in named.items()} if baselines is None else baselines
     contenders, absent = find_contenders(loads)

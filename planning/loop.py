@@ -91,8 +91,9 @@ def run_episode(
 ) -> EpisodeResult:
     """Reset a `control="primitive"` environment and pursue a goal in it.
 
-    From `info` the planner is given the camera only. `is_success` and the reward are read for the result and nothing
-    else.
+    From `info` the planner is given the camera only. Reward, `terminated` and `is_success`, by which the simulator
+    tells success, are read for the result and nothing else: whoever does not see that the goal is reached goes on, and
+    may undo it.
 
     Args:
         goal: by default what the environment's instruction says.
@@ -132,14 +133,14 @@ def run_episode(
             break
         seen = rgb
         within_reach = np.clip(action.to_action(), env.action_space.low, env.action_space.high)
-        observation, reward, terminated, truncated, info = env.step(within_reach)
+        observation, reward, _, truncated, info = env.step(within_reach)
         rgb, gained = observation["rgb"], gained + float(reward)
         frames.append(_frames(info, rgb))
         reached = _looks_reached(planner, rgb, goal, _grounder(info, camera, privileged))
         attempts.append(Attempt(seen, plan, instruction, rollout, action, reached))
         if replan:
             queue = []
-        if terminated or truncated or (reached if replan else not queue):
+        if truncated or (reached if replan else not queue):
             break
     return EpisodeResult(
         success=bool(info["is_success"]),

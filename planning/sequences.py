@@ -37,9 +37,9 @@ class SequencePlanner:
     """Beam search over sequences of instructions.
 
     Each step is imagined from where the last imagined one ended. A step moves one of the blocks that the goal
-    names into any bowl of the scene in which no other block lies by then: a bowl has room for one, and a
-    model that has never seen two meet in a bowl imagines that both fit. A sequence is worth the mean, over
-    the goal's open pairs, of the score of its whole imagined course.
+    names into any bowl of the scene; with `one_a_bowl` only into one in which no other block is seen to lie
+    by then: a model that has never seen two blocks meet in a bowl imagines that both fit. A sequence is worth
+    the mean, over the goal's open pairs, of the score of its whole imagined course.
 
     Attributes:
         world_model: imagines.
@@ -48,6 +48,7 @@ class SequencePlanner:
         horizon: frames to imagine for each step.
         stride: of the frames during a carry, every how many are decoded and scored.
         beam: how many sequences are kept after each step; 0 keeps all (exhaustive).
+        one_a_bowl: know that a bowl has room for one block.
         seed: of the slot sampling.
     """
 
@@ -57,6 +58,7 @@ class SequencePlanner:
     horizon: int = 24
     stride: int = 3
     beam: int = 4
+    one_a_bowl: bool = True
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
@@ -88,10 +90,7 @@ class SequencePlanner:
             if pair.block not in {done.block for done in branch.instructions}
             for bowl in grounding.bowls
         ]
-        masks_BKHW = hard_masks(starts.decode_masks([-1])[:, 0]).cpu().numpy()
-        inside = [contents(masks_KHW, grounding) for masks_KHW in masks_BKHW]
-        # Should no bowl have room, trying is better than giving up.
-        steps = [(row, one) for row, one in possible if inside[row][one.bowl] <= {one.block}] or possible
+        steps = self._with_room(possible, starts, grounding) if self.one_a_bowl else possible
         texts = [instruction.text for _, instruction in steps]
         rows = [row for row, _ in steps]
         rollout = self.world_model.rollout(starts.select(rows), texts, horizon=self.horizon, seed=self.seed)
@@ -114,3 +113,13 @@ class SequencePlanner:
                 )
             )
         return grown, rollout
+
+    @staticmethod
+    def _with_room(
+        steps: list[tuple[int, Instruction]], starts: Rollout, grounding: Grounding
+    ) -> list[tuple[int, Instruction]]:
+        """Those steps, each with its row of `starts`, into whose bowl no other block is seen to lie."""
+        masks_BKHW = hard_masks(starts.decode_masks([-1])[:, 0]).cpu().numpy()
+        inside = [contents(masks_KHW, grounding) for masks_KHW in masks_BKHW]
+        # Should no bowl have room, trying is better than giving up.
+        return [(row, one) for row, one in steps if inside[row][one.bowl] <= {one.block}] or steps

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from textocvp.precision import full_precision
 from textocvp.slots import pixel_grid
 
 CHROMA_WEIGHT = 2.0
@@ -51,7 +52,7 @@ def color_features(colors: Tensor) -> Tensor:
 
 def squared_distances(a: Tensor, b: Tensor) -> Tensor:
     """(B, N, M) squared Euclidean distances between a (B, N, C) and b (B, M, C)."""
-    with torch.autocast(a.device.type, enabled=False):
+    with full_precision(a):
         a, b = a.float(), b.float()
         cross = a @ b.transpose(1, 2)
     return (a.square().sum(-1, keepdim=True) + b.square().sum(-1)[:, None] - 2 * cross).clamp_min(0)

@@ -241,6 +241,28 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> In
     return Interval(rate, low, high, trials)
 
 
+def ratio_interval(above: Interval, below: Interval) -> Interval:
+    """The ratio of two independent figures that are not negative, with an interval made from theirs.
+
+    MOVER (Donner and Zou, "Closed-form confidence intervals for functions of the normal mean and standard deviation",
+    2012): unlike a bootstrap it is not empty for two rates of 1. `high` is inf where `below` may be 0.
+
+    Raises:
+        ValueError: if the figure `below` is 0.
+    """
+    p, q = above.value, below.value
+    if q <= 0:
+        raise ValueError("the ratio to 0 is not defined")
+
+    def bound(one: float, other: float, sign: int) -> float:
+        scale = other * (2 * q - other)
+        inner = max(0.0, (p * q) ** 2 - one * other * (2 * p - one) * (2 * q - other))
+        return (p * q + sign * inner**0.5) / scale if scale > 0 else float("inf")
+
+    low, high = bound(above.low, below.high, -1), bound(above.high, below.low, 1)
+    return Interval(p / q, 0.0 if low == float("inf") else max(0.0, low), high, min(above.n, below.n))
+
+
 def bootstrap_interval(
     values: Any, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
 ) -> Interval:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 from experiments.protocol.ablation_runs import RUNS
-from experiments.protocol.ablation_scenes import LENGTH, FollowingOutcome, Parsed, ParsingOutcome
+from experiments.protocol.ablation_scenes import ENDS, LENGTH, FollowingOutcome, Parsed, ParsingOutcome
+from experiments.protocol.closed_loop import LoopOutcome
 from experiments.protocol.figures import mean_row, rate_row
 from experiments.reporting import Row
 
@@ -25,15 +26,24 @@ def following_rows(outcomes: Sequence[FollowingOutcome]) -> list[Row]:
     rows = []
     for split, method, here in _groups(outcomes):
         found = [outcome.models[method] for outcome in here]
-        for metric, name in (("ends_in_bowl", "ends_V"), ("predicted_success", "success_V")):
+        for metric, name in ((ENDS, "ends_V"), ("predicted_success", "success_V")):
             values = [getattr(one, name) for one in found]
             rows.append(rate_row(method, split, "original", metric, [v[0] for v in values]))
             if len(values[0]) > 1:
                 rows.append(rate_row(method, split, "variants mean", metric, [v[1:] for v in values]))
         if len(found[0].wrong_V):
-            rows.append(rate_row(method, split, "wrong text", "ends_in_bowl", [one.wrong_V for one in found]))
+            rows.append(rate_row(method, split, "wrong text", ENDS, [one.wrong_V for one in found]))
         for metric in found[0].pictures:
             rows.append(mean_row(method, split, PICTURES, metric, [f.pictures[metric] for f in found]))
+    return rows
+
+
+def acted_rows(outcomes: Sequence[tuple[str, LoopOutcome]]) -> list[Row]:
+    """Success in the closed loop of a robot that plans with each model, and of those that plan with none."""
+    rows = []
+    for method in dict.fromkeys(name for name, _ in outcomes):
+        here = [outcome.success for name, outcome in outcomes if name == method]
+        rows.append(rate_row(method, "controllability", "original", "closed_loop_success", here))
     return rows
 
 
@@ -69,10 +79,11 @@ def headline(rows: Sequence[Row]) -> dict[str, float]:
         word = name.replace("-", "_")
         place = (name, "controllability")
         wanted[f"{word}_original_strict"] = (*place, "original", "predicted_success")
-        wanted[f"{word}_original"] = (*place, "original", "ends_in_bowl")
-        wanted[f"{word}_variants_mean"] = (*place, "variants mean", "ends_in_bowl")
-        wanted[f"{word}_wrong_text"] = (*place, "wrong text", "ends_in_bowl")
-        wanted[f"{word}_unseen_colors"] = (name, "unseen_colors", "original", "ends_in_bowl")
+        wanted[f"{word}_original"] = (*place, "original", ENDS)
+        wanted[f"{word}_variants_mean"] = (*place, "variants mean", ENDS)
+        wanted[f"{word}_wrong_text"] = (*place, "wrong text", ENDS)
+        wanted[f"{word}_unseen_colors"] = (name, "unseen_colors", "original", ENDS)
+        wanted[f"{word}_closed_loop"] = (*place, "original", "closed_loop_success")
         wanted[f"{word}_miou"] = (name, "test", "true frames", "miou")
     for count in SLOT_COUNTS:
         for split, words in (("test", "6_objects"), ("more_objects", "8_objects")):

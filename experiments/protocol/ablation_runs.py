@@ -2,7 +2,8 @@
 
 One list for both sides: `experiments/train_ablations.py` trains it, `experiments/ablations.py` measures it. All
 predictor runs learn from the slots of one parser, the shipped one, from the same episodes in the same order, with
-the same number of updates; all parser runs share episodes, order and updates likewise.
+the same number of updates; all parser runs share episodes, order and updates likewise. Runs with the lexicon also
+learn from recoloured scenes, which other text encoders cannot (`textocvp.predictor_data`).
 """
 
 from __future__ import annotations

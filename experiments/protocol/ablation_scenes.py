@@ -21,6 +21,7 @@ from textocvp.following import PIXEL, REACHED
 from textocvp.metrics import psnr
 
 NEAR = REACHED / PIXEL  # pixels of 64
+ENDS = f"ends_within_{NEAR:g}_px"  # the metric: the block's mask ends that near to the bowl's
 LENGTH = 9  # frames that pictures are compared over: the paper's shorter length
 
 

@@ -12,6 +12,9 @@ import tyro
 
 from textocvp.model import CheckpointError
 
+#: Each seed has scenes of its own, and a split has so many.
+LARGEST_SEED = 999
+
 
 class UsageError(ValueError):
     """Arguments that do not go together, or do not fit the model."""
@@ -28,7 +31,7 @@ class StudyArgs:
     checkpoint: str = "tabletop-small"
     """Bundled name, folder, or id on the Hugging Face hub."""
     out: Path = Path("results/study")
-    """Folder for results.json, report.html, plots and clips."""
+    """Folder for results.json, report.html, plots and clips; --quick has a default of its own, in results/quick."""
     seed: int = 0
     """Chooses the scenes and seeds the slots. The same seed gives the same figures."""
     quick: bool = False
@@ -39,8 +42,11 @@ class StudyArgs:
     def __post_init__(self) -> None:
         if self.workers < 0:
             raise UsageError(f"--workers must be at least 0, got {self.workers}")
-        if self.seed < 0:
-            raise UsageError(f"--seed must be at least 0, got {self.seed}")
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise UsageError(f"--seed must be 0 to {LARGEST_SEED}, got {self.seed}")
+        if self.quick and self.out == type(self).out:
+            # A first look must not take the place of figures that took hours.
+            self.out = self.out.parent / "quick" / self.out.name
 
     def command(self, study: str) -> str:
         """What to type for the same figures: every argument that changes them and is not at its default.

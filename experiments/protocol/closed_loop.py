@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.protocol.predicted import HORIZON
 from experiments.protocol.scenes import Drawn, TestScene, draw, play
-from experiments.protocol.workers import Worker
+from experiments.protocol.workers import LoadWorldModel, Worker
 from planning import (
     EpisodeResult,
     Goal,
@@ -59,6 +59,7 @@ class LoopEpisode:
         variant: 0 for the scene's own instruction, i for its i-th variant with another target bowl.
         variants: how many variants there are.
         seed: of the slot sampling and of the random candidate.
+        load: makes the world model that is planned with; by default the study's own.
     """
 
     method: Method
@@ -66,6 +67,7 @@ class LoopEpisode:
     variant: int = 0
     variants: int = 0
     seed: int = 0
+    load: LoadWorldModel | None = None
 
     def run(self, worker: Worker) -> LoopOutcome:
         """Play the episode."""
@@ -104,9 +106,10 @@ class LoopEpisode:
         )
 
     def _planner(self, worker: Worker, goal: Goal) -> Planner:
+        world_model = worker.world_model if self.load is None else worker.other(self.load)
         if self.method == "random candidate":
             # Seeded by scene and variant too: one stream for all episodes would depend on their order.
             rng = np.random.default_rng([self.seed, self.scene.seed, self.variant])
-            return RandomPlanner(worker.world_model, rng, horizon=HORIZON, seed=self.seed)
+            return RandomPlanner(world_model, rng, horizon=HORIZON, seed=self.seed)
         kind = InstructionPlanner if len(goal.pairs) == 1 else SequencePlanner
-        return kind(worker.world_model, horizon=HORIZON, seed=self.seed)
+        return kind(world_model, horizon=HORIZON, seed=self.seed)

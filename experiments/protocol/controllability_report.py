@@ -219,20 +219,27 @@ def _loop_plot(rows: Sequence[Row]) -> Figure:
     return interval_plot("closed_loop.png", columns, series, label="closed-loop success", caption=caption)
 
 
+FARTHEST = 64
+"""Pixels along a side of the frame."""
+
+
 def _distance_plot(outcomes: Sequence[PredictedOutcome]) -> Figure:
     curves = []
     for title, name in (("imagined", "imagined_TV"), ("true frames", "true_TV")):
-        columns = [column for outcome in outcomes for column in getattr(outcome, name).T]
+        # Without the observed frame.
+        columns = [column[1:] for outcome in outcomes for column in getattr(outcome, name).T]
         length = max(len(column) for column in columns)
         distances = np.stack([np.pad(column, (0, length - len(column)), mode="edge") for column in columns])
-        distances[~np.isfinite(distances)] = np.nan
-        low, middle, high = np.nanquantile(distances, (0.1, 0.5, 0.9), axis=0)
+        # What cannot be seen is farther off than anything that can.
+        distances[~np.isfinite(distances)] = FARTHEST
+        low, middle, high = np.quantile(distances, (0.1, 0.5, 0.9), axis=0)
         curves.append((title, np.stack([middle, low, high], axis=1)))
     return curve_plot(
         "distance.png",
         curves,
         label="block to bowl, px",
         across="frame",
-        caption="Distance of the named block to the named bowl: median, and the middle 80 % of all cases.",
+        caption="Distance of the named block to the named bowl: median, and the middle 80 % of all cases. One that "
+        f"cannot be seen counts as {FARTHEST} px.",
         marks=[(THRESHOLDS.block_bowl_px, "counts as in the bowl")],
     )

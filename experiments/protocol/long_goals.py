@@ -52,24 +52,26 @@ class LongMethod:
 
     Attributes:
         name: of the row.
-        chooser: who chooses the steps. `plan`: the world model's best imagined sequence. `told`: they are the goal's
+        chooser: who chooses the steps. `plan`: the world model's best imagined sequence, among those that put no block
+            into a bowl where another is seen. `plan, no rule`: among all. `told`: they are the goal's
             own, in random order. `random`: as many random instructions. `expert`: the scripted expert in an order
             that works. `as written`: the scripted expert in the sentence's order.
         replan: whether somebody looks again after every action, and chooses anew while the goal is not seen reached.
     """
 
     name: str
-    chooser: Literal["plan", "told", "random", "expert", "as written"]
+    chooser: Literal["plan", "plan, no rule", "told", "random", "expert", "as written"]
     replan: bool = False
 
     def plays(self, column: LongColumn) -> bool:
         """Whether it is a row of that column."""
-        return self.chooser != "as written" or column.split == TAKEN
+        return self.chooser not in ("as written", "plan, no rule") or column.split == TAKEN
 
 
 METHODS = (
     LongMethod("ours, replanning", "plan", True),
     LongMethod("ours, one plan", "plan"),
+    LongMethod("ours without the rule, replanning", "plan, no rule", True),
     LongMethod("random order, replanning", "told", True),
     LongMethod("random order, one plan", "told"),
     LongMethod("random sequence, replanning", "random", True),
@@ -170,8 +172,9 @@ class LongEpisode:
         )
 
     def _planner(self, worker: Worker) -> Planner:
-        if self.method.chooser == "plan":
-            return SequencePlanner(worker.world_model, horizon=HORIZON, seed=self.seed)
+        if self.method.chooser in ("plan", "plan, no rule"):
+            rule = self.method.chooser == "plan"
+            return SequencePlanner(worker.world_model, horizon=HORIZON, one_a_bowl=rule, seed=self.seed)
         told = self.method.chooser == "told"
         # Seeded by the scene too: one stream for all episodes would depend on their order. With and without another
         # look the first sequence is the same.

@@ -151,7 +151,7 @@ def build_report(
     """
     rows = results.rows
     length = max(length for length in LENGTHS if results.find("ours", mean_to(length), "iou"))
-    missing = f" {absent_text(absent)}" if absent else f" {TRAINED_LITTLE}"
+    missing = f" {TRAINED_LITTLE}" + (f" {absent_text(absent)}" if absent else "")
     overlap = Section(
         "Mask IoU against the simulator",
         "Slots are matched to the blocks and bowls that are seen, anew in every frame (Hungarian), and overlaps are "

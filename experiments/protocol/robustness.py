@@ -18,7 +18,7 @@ from experiments.protocol.scenes import TestScene
 from experiments.protocol.workers import Worker
 from experiments.reporting import Row
 from planning import PinholeCamera
-from textocvp.metrics import Interval, relative_change
+from textocvp.metrics import Interval, ratio_interval, relative_change, wilson_interval
 
 #: Split -> name. The first is what the model was trained for; the others are what it was not.
 SPLITS = {"test": "test set", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
@@ -126,7 +126,13 @@ class Column:
         reference, values = (self.values.get(name, np.empty(0)) for name in (REFERENCE, split))
         if not len(values) or not len(reference) or reference.mean() == 0:
             return None
-        change = relative_change(values, reference)
+        if self.metric.endswith("success"):
+            # A bootstrap of rates of 1 would be sure that nothing is lost.
+            rates = [wilson_interval(float(part.sum()), len(part)) for part in (values, reference)]  # type: ignore[arg-type]
+            ratio = ratio_interval(*rates)
+            change = Interval(ratio.value - 1, ratio.low - 1, ratio.high - 1, ratio.n)
+        else:
+            change = relative_change(values, reference)
         if self.metric in DISTANCES:
             return change
         return Interval(-change.value, -change.high, -change.low, change.n)

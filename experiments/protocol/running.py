@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from experiments.protocol.arguments import StudyArgs
+from experiments.protocol.arguments import StudyArgs, UsageError
 from experiments.protocol.workers import LoadCheckpoint, LoadWorldModel, Pool, StudyModel, available_cores
 from experiments.reporting import (
     Checkpoint,
@@ -40,19 +40,30 @@ class StudyRun:
     began: float
 
     @classmethod
-    def open(cls, study: str, args: StudyArgs, load: LoadWorldModel | None = None) -> StudyRun:
+    def open(
+        cls, study: str, args: StudyArgs, load: LoadWorldModel | None = None, horizon: int = 1
+    ) -> StudyRun:
         """Check that the study can be run.
 
         Args:
             load: makes the world model; by default loads `args.checkpoint`.
+            horizon: how many frames it must be able to imagine at once.
 
         Raises:
             OSError: if the folder cannot be written.
             CheckpointError: if there is no such checkpoint.
+            UsageError: if it cannot look that far ahead.
         """
         folder, began = OutputFolder(args.out), time.monotonic()
         load = load or LoadCheckpoint(args.checkpoint)
-        return cls(study, args, folder, load, load(), began)
+        world_model = load()
+        longest = world_model.longest_horizon
+        if longest is not None and longest < horizon:
+            raise UsageError(
+                f"{args.checkpoint} imagines {longest} frames at most (predictor.window), and this study needs "
+                f"{horizon}"
+            )
+        return cls(study, args, folder, load, world_model, began)
 
     @property
     def pool(self) -> Pool:

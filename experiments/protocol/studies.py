@@ -129,7 +129,7 @@ STUDIES = (
             "lexicon_no_bias_variants_mean",
         ),
         picks=(
-            Pick("block ends in the bowl", "ends_in_bowl", (*_BOWLS, ("unseen_colors", "original"))),
+            Pick("block ends within 6 px", "ends_within_6_px", (*_BOWLS, ("unseen_colors", "original"))),
             Pick(
                 "mIoU of parsed objects", "miou", (("test", "true frames"), ("more_objects", "true frames"))
             ),

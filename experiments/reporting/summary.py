@@ -34,11 +34,9 @@ def study_markdown(title: str, results: Results, picks: Sequence[Pick]) -> str:
     tables = [table for pick in picks if (table := _pivot(results.rows, pick))]
     for table in tables or [_headline(results)]:
         lines += [table, ""]
-    counts = sorted({row.n for row in results.rows})
-    n = f"n = {counts[0]}" + (f" to {counts[-1]}" if len(counts) > 1 else "") if counts else "no figures"
     quick = "**Quick run**: a first look, not the figures to quote. " if results.quick else ""
     lines.append(
-        f"{quick}`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), {n}, 95 % intervals in brackets."
+        f"{quick}`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), 95 % intervals in brackets."
     )
     return "\n".join(lines) + "\n"
 
@@ -55,9 +53,12 @@ def _pivot(rows: Sequence[Row], pick: Pick) -> str:
         return ""
     splits = {split for split, _ in columns}
     names = [_words(variant if len(splits) == 1 else f"{split}, {variant}") for split, variant in columns]
-    lines = [f"| {pick.title} | " + " | ".join(names) + " |", "|---" * (len(columns) + 1) + "|"]
+    shown = [row for method in methods for column in columns if (row := found.get((method, *column)))]
+    counts = {row.n for row in shown}
+    title = f"{pick.title}, n = {counts.pop()}" if len(counts) == 1 else pick.title
+    lines = [f"| {title} | " + " | ".join(names) + " |", "|---" * (len(columns) + 1) + "|"]
     for method in methods:
-        cells = [_cell(found.get((method, *column)), pick.digits) for column in columns]
+        cells = [_cell(found.get((method, *column)), pick.digits, bool(counts)) for column in columns]
         lines.append(f"| {_words(method)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -68,11 +69,12 @@ def _headline(results: Results) -> str:
     return "\n".join(lines)
 
 
-def _cell(row: Row | None, digits: int) -> str:
+def _cell(row: Row | None, digits: int, with_n: bool) -> str:
     if row is None:
         return DASH
-    value = f"{row.value:.{digits}f}"
-    return value if row.low == row.high else f"{value} ({row.low:.{digits}f} to {row.high:.{digits}f})"
+    notes = [f"{row.low:.{digits}f} to {row.high:.{digits}f}"] if row.n > 1 else []
+    notes += [f"n = {row.n}"] if with_n else []
+    return f"{row.value:.{digits}f}" + (f" ({', '.join(notes)})" if notes else "")
 
 
 def _words(name: str) -> str:

@@ -19,11 +19,23 @@ _STYLES: dict[Kind, str] = {"ours": "bold", "control": "dim", "ceiling": "", "pa
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure: its text, and its interval as text (empty when there is none)."""
+    """One figure.
+
+    Attributes:
+        text: the figure.
+        interval: of 95 %, empty when there is none.
+        n: how many scenes it is from; None where nothing was measured.
+    """
 
     text: str
     interval: str = ""
     n: int | None = None
+
+    def below(self, with_n: bool) -> str:
+        """What stands below the figure: its interval, and on demand its n."""
+        return ", ".join(
+            part for part in (self.interval, f"n = {self.n}" if with_n and self.n else "") if part
+        )
 
     @classmethod
     def of(cls, row: Row | None, digits: int = 2) -> Cell:
@@ -32,7 +44,8 @@ class Cell:
             return cls(DASH)
         between = " to " if row.low < 0 else DASH  # a dash beside a minus sign cannot be read
         interval = f"{row.low:.{digits}f}{between}{row.high:.{digits}f}"
-        return cls(f"{row.value:.{digits}f}", "" if row.low == row.high else interval, row.n)
+        # A single scene has no interval.
+        return cls(f"{row.value:.{digits}f}", "" if row.n < 2 else interval, row.n)
 
 
 @dataclass(frozen=True)
@@ -66,27 +79,29 @@ class Table:
                     f"row {row.label!r} has {len(row.cells)} cells, the table {len(self.columns)} columns"
                 )
 
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Every n of its figures, sorted. With one only, the caption says it; otherwise each figure does."""
+        return tuple(sorted({cell.n for row in self.rows for cell in row.cells if cell.n}))
+
+    @property
+    def full_caption(self) -> str:
+        """The caption, with the n of all figures where that is the same."""
+        n = f"n = {self.counts[0]}." if len(self.counts) == 1 else ""
+        return " ".join(part for part in (self.caption, n) if part)
+
     def to_rich(self, intervals: bool = True) -> RichTable:
         """For the terminal."""
         table = RichTable(title=self.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-        table.caption, table.caption_justify, table.caption_style = self.caption or None, "left", "dim"
+        table.caption, table.caption_justify, table.caption_style = self.full_caption or None, "left", "dim"
         table.add_column("")
         for column in self.columns:
             table.add_column(column, justify="right", no_wrap=len(column) < 9)
         for row in self.rows:
+            below = [cell.below(len(self.counts) > 1) if intervals else "" for cell in row.cells]
             cells = [
-                f"{c.text}\n[dim not bold not italic]{c.interval}[/]" if intervals and c.interval else c.text
-                for c in row.cells
+                f"{cell.text}\n[dim not bold not italic]{small}[/]" if small else cell.text
+                for cell, small in zip(row.cells, below, strict=True)
             ]
             table.add_row(row.label, *cells, style=_STYLES[row.kind])
         return table
-
-    def to_markdown(self) -> str:
-        """For a README."""
-        lines = [
-            f"| {self.title} | " + " | ".join(self.columns) + " |",
-            "|---" * (len(self.columns) + 1) + "|",
-        ]
-        for row in self.rows:
-            lines.append(f"| {row.label} | " + " | ".join(c.text for c in row.cells) + " |")
-        return "\n".join(lines) + "\n"

@@ -40,7 +40,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
     args = Args(out=out, runs=runs, quick=True, workers=1)
-    main(args, sizes=Sizes(following=1, unseen=1, parsing=1, slots=1), slot_counts=(4, 12))
+    main(args, sizes=Sizes(following=2, unseen=1, acted=1, parsing=1, slots=1, clips=1), slot_counts=(4, 12))
     return out
 
 
@@ -99,8 +99,10 @@ def test_rows_count_scenes() -> None:
     rows = {(row.variant, row.metric): row for row in following_rows(outcomes)}
     assert rows["original", "predicted_success"].value == 0.5
     assert rows["variants mean", "predicted_success"].value == 0.75
-    assert rows["original", "ends_in_bowl"].value == rows["variants mean", "ends_in_bowl"].value == 1.0
-    assert rows["wrong text", "ends_in_bowl"].value == pytest.approx(1 / 6)
+    assert (
+        rows["original", "ends_within_6_px"].value == rows["variants mean", "ends_within_6_px"].value == 1.0
+    )
+    assert rows["wrong text", "ends_within_6_px"].value == pytest.approx(1 / 6)
     assert rows["9 frames", "psnr"].value == 20.5
     assert {row.n for row in rows.values()} == {2}
     parsed = [ParsingOutcome(scene, {"savi-cluster": Parsed(0.5, 0.4, 0.3, 20.0)}) for scene in scenes]
