@@ -127,7 +127,7 @@ def main(
         PredictionScene(scene, tuple(contenders), measures, args.seed)
         for scene in test_scenes(SPLIT, sizes.scenes, args.seed)
     ]
-    parts = {"scenes": len(units), "pictures": 2 * min(sizes.clips, len(units) // 2)}
+    parts = {"scenes": len(units), "pictures": min(2 * sizes.clips, len(units))}
     outcomes: list[PredictionOutcome] = []
     with StudyProgress({part: (n, SECONDS[part]) for part, n in parts.items()}) as progress:
         for outcome in progress.track("scenes", pool.run(units)):
@@ -139,7 +139,7 @@ def main(
         clips = list(progress.track("pictures", pool.run(pictures)))
     seeds = {"slots": [args.seed], "scenes": [unit.scene.seed for unit in units]}
     results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
-    best = len(clips) // 2
+    best = (len(clips) + 1) // 2
     report = build_report(results, contenders, absent, measures, clips[:best], clips[best:], run.command)
     run.write(report)
     tables = [paper_table(rows, absent), episode_table(rows, absent), upper_table(rows, absent, measures)]

@@ -58,7 +58,7 @@ class Args(StudyArgs):
     out: Path = Path("results/robustness")
     """Folder for results.json, report.html, plots and clips."""
     scenes: int = 0
-    """Scenes of each kind, for frames and masks and for the closed loop; 0 for 50, or 5 with --quick."""
+    """Scenes of each kind, for frames and masks and for the closed loop; 0 for 50, or with --quick 5 and 8."""
     ocvp_seq: str = "ocvp-seq-small"
     """Checkpoint of OCVP-Seq: a bundled name, a folder or a hub id."""
     non_oc: str = "non-oc-small"
@@ -170,7 +170,7 @@ def main(
         pictures = list(progress.track("robot's films", pool.run(robot)))
     seeds = {"slots": [args.seed], **_seeds(scenes, episodes)}
     results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
-    half = len(clips) // 2
+    half = (len(clips) + 1) // 2
     report = build_report(results, absent, measures, clips[:half], clips[half:], pictures, run.command)
     run.write(report)
     tables = [

@@ -12,8 +12,8 @@ Judging rollouts without a robot (the predicted study):
     camera = PinholeCamera.from_info(info["camera"])
     instruction = Instruction.parse(text)                       # block colour, bowl colour
     rollout = world_model.rollout(obs, [text] * n)
-    groundings = ground(rollout, camera)                        # one a batch item, or pass one for all of
-    them trace = measure_rollout(rollout, groundings, instruction)   # distances in pixels, (B, T)
+    groundings = ground(rollout, camera)                             # one a rollout, or pass one for all
+    trace = measure_rollout(rollout, groundings, instruction)        # distances in pixels, (B, T)
     success_B = Judge()(trace)
 
 Nothing here reads the simulator's state, except `ground_privileged`, whose name says so.

@@ -171,7 +171,7 @@ def build_report(
         f"{intro} {measures.absent}",
         [*tables, *predictor_plot(rows, found)],
     )
-    half = len(clips) // 2
+    half = (len(clips) + 1) // 2
     films = [
         Section(
             f"Imagined beside real, {title}",

@@ -70,7 +70,10 @@ class FilmPicture:
 
 
 def extremes(cases: Sequence[T], badness: Sequence[float], count: int) -> tuple[list[T], list[T]]:
-    """The `count` best cases and the `count` worst ones, most extreme first; no case is both."""
+    """The `count` best cases and the `count` worst ones, most extreme first; no case is both. Of an odd number of cases
+    too few for all, the best have one more.
+    """
     order = [int(i) for i in np.argsort(np.asarray(badness), kind="stable")]
-    count = min(count, len(cases) // 2)
-    return [cases[i] for i in order[:count]], [cases[i] for i in reversed(order[len(order) - count :])]
+    worst = min(count, len(cases) // 2)
+    best = min(count, len(cases) - worst)
+    return [cases[i] for i in order[:best]], [cases[i] for i in reversed(order[len(order) - worst :])]

@@ -146,8 +146,8 @@ def _cards(results: Results, split: str) -> list[Card]:
 
     window = f"{WINDOW} / {OURS}"
     return [
-        card("Window over cache, 9 frames", window, "predict, 9 x 1", "ratio", " x", "prototype: 2.4 x"),
-        card("The same, 16 scenes", window, "predict, 9 x 16", "ratio", " x", "prototype: 4.0 x"),
+        card("Window over cache, 9 frames", window, "predict, 9 x 1", "ratio", " x", "our prototype: 2.4 x"),
+        card("The same, 16 scenes", window, "predict, 9 x 16", "ratio", " x", "our prototype: 4.0 x"),
         card("Window over cache, paper's sizes", PAPER, "predict, 9 x 1", "ratio", " x", "untrained"),
         card("MAGE over TextOCVP, 9 frames", MAGE, "all, 9 x 1", "ratio", " x", "all phases"),
         card(

@@ -66,6 +66,21 @@ def test_what_is_done_is_not_run_again(args: Args) -> None:
     assert ran(replace(args, seed=1, quick=False)) == (0, ["first", "second", "third"])
 
 
+def test_results_of_other_code_or_of_another_hand_are_not_kept(args: Args, monkeypatch) -> None:
+    ran(args)
+    monkeypatch.setattr(everything, "code_digest", lambda: "later")
+    assert ran(args) == (0, ["first", "second", "third"])
+    # What somebody ran on its own may have had other options: nothing says.
+    (args.out / everything.RECORD).unlink()
+    assert ran(args) == (0, ["first", "second", "third"])
+
+
+def test_what_fails_when_it_is_run_again_does_not_count_as_done(args: Args) -> None:
+    ran(args)
+    assert ran(replace(args, fresh=True), "second") == (1, ["first", "second", "third"])
+    assert ran(args) == (0, ["second"])
+
+
 def test_a_failure_is_told_and_the_others_go_on(args: Args) -> None:
     assert ran(args, "second") == (1, ["first", "second", "third"])
     page = (args.out / "index.html").read_text()
@@ -159,9 +174,11 @@ def test_the_summary_is_made_of_the_rows() -> None:
         "",
         "| SSIM | 9 frames | 19 frames |",
         "|---|---|---|",
-        "| ours | 0.951 (0.940 to 0.960) | 0.930 (0.920 to 0.940) |",
-        "| MAGE | 0.900 | \u2013 |",
+        "| ours | 0.951 (0.940 to 0.960, n = 60) | 0.930 (0.920 to 0.940, n = 55) |",
+        "| MAGE | 0.900 (0.900 to 0.900, n = 60) | \u2013 |",
     ]
+    one = [Pick("SSIM", "ssim", columns[:1], digits=3)]
+    assert "| SSIM, n = 60 | 9 frames |" in study_markdown("P", replace(examples.results(), rows=rows), one)
     assert "n = 55 to 60" in text and "Quick" not in text
     plain = study_markdown("Prediction", examples.results(quick=True), [Pick("SSIM", "ssim", columns)])
     assert "| predicted original | 0.9 |" in plain and "**Quick run**" in plain

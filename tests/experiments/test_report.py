@@ -102,15 +102,27 @@ def test_a_table_needs_a_cell_a_column() -> None:
         Table("t", ["a", "b"], [TableRow("ours", [Cell("1")])])
 
 
-def test_the_table_reads_the_same_everywhere() -> None:
+def test_the_terminal_shows_figures_and_intervals() -> None:
     table = Table("Success", ["original"], [TableRow("ours", [Cell.of(examples.row())])])
     console = Console(file=io.StringIO(), width=100)
     console.print(table.to_rich())
     assert "0.90" in console.file.getvalue() and "0.80\u20130.95" in console.file.getvalue()  # type: ignore[attr-defined]
-    assert "| ours | 0.90 |" in table.to_markdown()
     assert Cell.of(None).text == "\u2013"
-    assert Cell.of(Row("a", "b", "c", "d", 0.5, 0.5, 0.5, 1)).interval == ""
-    assert Cell.of(Row("a", "b", "c", "d", -0.5, -0.6, -0.4, 1)).interval == "-0.60 to -0.40"
+    assert Cell.of(Row("a", "b", "c", "d", 0.5, 0.5, 0.5, 1)).interval == ""  # one scene
+    assert Cell.of(Row("a", "b", "c", "d", 0.5, 0.5, 0.5, 2)).interval == "0.50\u20130.50"
+    assert Cell.of(Row("a", "b", "c", "d", -0.5, -0.6, -0.4, 9)).interval == "-0.60 to -0.40"
+
+
+def test_every_figure_says_how_many_scenes_it_is_from() -> None:
+    rows = [Row("ours", "test", name, "d", 0.5, 0.4, 0.6, n) for name, n in (("a", 60), ("b", 20))]
+    alike = Table("t", ["a"], [TableRow("ours", [Cell.of(rows[0])]), TableRow("paper", [Cell("0.8")])])
+    assert alike.full_caption == "n = 60."
+    mixed = Table("t", ["a", "b"], [TableRow("ours", [Cell.of(row) for row in rows])], "Of the test split.")
+    assert mixed.full_caption == "Of the test split."
+    console = Console(file=io.StringIO(), width=120)
+    console.print(alike.to_rich(), mixed.to_rich())
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "0.40\u20130.60, n = 20" in shown and shown.count("n = 60") == 2
 
 
 def test_progress_in_a_file_is_plain_lines() -> None:

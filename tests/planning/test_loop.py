@@ -21,6 +21,7 @@ from planning import (
     run_episode,
 )
 from tests.planning.oracle import OracleWorldModel
+from textocvp.rollout import Rollout
 
 
 class CameraOnly(gym.Wrapper):  # type: ignore[type-arg]
@@ -101,6 +102,21 @@ def test_a_missed_pick_is_seen_and_tried_again(env: gym.Env[Any, Any]) -> None:
     assert not once.success and not once.believes_reached and once.steps == 1
     never = run_episode(Missing(env, 9), planner, seed=1, max_attempts=2)
     assert not never.success and never.steps == 2 and never.gained == 0.0
+
+
+def test_nobody_is_told_of_success(env: gym.Env[Any, Any]) -> None:
+    """Who does not see the goal reached goes on, though the simulator says that the episode is over."""
+
+    class Blind(OracleWorldModel):
+        def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+            return super().parse(video, seed=seed) if len(self.calls) < 2 else self.first
+
+    oracle = oracle_for(env, 0)
+    blind = Blind(oracle.objects, oracle.camera)
+    blind.first = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
+    blind.calls = [0, 0]  # it sees the scene as it was before anything moved
+    result = run_episode(env, InstructionPlanner(blind), seed=0)
+    assert result.success and not result.believes_reached and result.steps == 3
 
 
 def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:

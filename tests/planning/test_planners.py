@@ -83,6 +83,16 @@ def test_a_taken_bowl_is_emptied_before_it_is_filled(oracle: OracleWorldModel, o
         assert first != Instruction("red", "blue") and first.bowl != second.bowl
 
 
+def test_without_the_rule_a_taken_bowl_is_filled_like_any_other(
+    oracle: OracleWorldModel, objects, camera
+) -> None:
+    objects[1]["position"] = (0.60, -0.10, 0.035)
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    planner = SequencePlanner(oracle, beam=0, one_a_bowl=False)
+    firsts = {one.instructions[0] for one in planner.plan(RGB, goal, AppearanceGrounder(camera)).ranking}
+    assert Instruction("red", "blue") in firsts
+
+
 def test_where_no_bowl_has_room_something_is_tried(oracle: OracleWorldModel, objects, camera) -> None:
     del objects[3:]  # the blue bowl is the only one, and green lies in it
     objects[1]["position"] = (0.60, -0.10, 0.035)

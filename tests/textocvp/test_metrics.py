@@ -15,6 +15,7 @@ from textocvp.metrics import (
     foreground_ari,
     object_ious,
     psnr,
+    ratio_interval,
     relative_change,
     slot_labels,
     ssim,
@@ -196,6 +197,22 @@ def test_wilson_agrees_with_scipy(successes, trials):
 def test_wilson_refuses_impossible_counts():
     with pytest.raises(ValueError, match="11 of 10"):
         wilson_interval(11, 10)
+
+
+def test_a_ratio_of_rates_is_as_sure_as_they_are():
+    # 8 of 8 twice: nothing was lost, but each rate may be as low as .676, and so the ratio 1.48 either way.
+    all_of_8 = wilson_interval(8, 8)
+    found = ratio_interval(all_of_8, all_of_8)
+    assert (found.value, found.low, found.high, found.n) == pytest.approx(
+        (1, all_of_8.low, 1 / all_of_8.low, 8)
+    )
+    # For many trials it is the textbook's interval on the logarithm (Katz 1978).
+    p, q, n = 0.6, 0.8, 4000
+    found = ratio_interval(wilson_interval(int(p * n), n), wilson_interval(int(q * n), n))
+    half = 1.96 * ((1 - p) / (p * n) + (1 - q) / (q * n)) ** 0.5
+    assert (found.low, found.high) == pytest.approx((p / q * np.exp(-half), p / q * np.exp(half)), rel=1e-3)
+    with pytest.raises(ValueError, match="ratio to 0"):
+        ratio_interval(all_of_8, wilson_interval(0, 8))
 
 
 def test_bootstrap_covers_the_truth_about_as_often_as_it_says():

@@ -94,6 +94,14 @@ def test_moments_of_a_box() -> None:
     torch.testing.assert_close(scale[0, 0] * 32, torch.tensor([(63 / 12) ** 0.5, (255 / 12) ** 0.5]))
 
 
+def test_moments_are_as_precise_under_autocast() -> None:
+    mask = torch.zeros(1, 1, 64, 64)
+    mask[..., 52:58, 50:56] = 1
+    with torch.autocast("cpu", torch.bfloat16):
+        position, scale = moments(mask.bfloat16())
+    torch.testing.assert_close((position, scale), moments(mask))
+
+
 def test_configurations_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="explicit"):
         build_parser(ParserConfig(layout=SlotLayout(content=8, explicit=False)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -156,8 +157,20 @@ def test_places_sizes_and_colours_are_read_off_slots_that_say() -> None:
     assert renderer_of(rollout).pictures == 0
 
 
-@pytest.mark.parametrize(("index", "kept"), [(1, [1]), (-1, [2]), (slice(0, 2), [0, 1]), ([2, 0], [2, 0])])
-def test_select_keeps_what_was_decoded(index: int | slice | list[int], kept: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("index", "kept"),
+    [
+        (1, [1]),
+        (-1, [2]),
+        (slice(0, 2), [0, 1]),
+        ([2, 0], [2, 0]),
+        (np.int64(1), [1]),
+        (np.array([2, 1]), [2, 1]),
+        (torch.tensor(2), [2]),
+        (torch.tensor([0, 2]), [0, 2]),
+    ],
+)
+def test_select_keeps_what_was_decoded(index: Any, kept: list[int]) -> None:
     rollout = boxes(B=3)
     masks = rollout.masks
     part = rollout.select(index)

@@ -23,6 +23,7 @@ from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
 from textocvp.train_predictor import Dynamics, PredictorTraining, train, true_frames
+from textocvp.world_model import WorldModel
 
 LAYOUT = SlotLayout(content=4)
 OCVP_SEQ = replace(
@@ -109,6 +110,35 @@ def test_a_killed_run_continues_exactly(run, config, monkeypatch):
         if not torch.equal(a[name], tensor)
     }
     assert changed == {"text", "predictor"}  # parser and renderer are frozen
+
+
+def test_a_checkpoint_knows_how_far_it_was_trained(run):
+    args = run(PLACED, "run")
+    TextOCVP(replace(build(PLACED).config, stage="parser")).save_pretrained(args.parser)
+    with pytest.raises(training.SettingsError, match="no trained predictor to finetune"):
+        train(replace(args, finetune=True))
+    with pytest.warns(UserWarning, match="first stage of training only"):
+        WorldModel.from_pretrained(args.parser).rollout(
+            np.zeros((32, 32, 3), np.uint8), "put the red block in the blue bowl", horizon=1
+        )
+    train(args)
+    assert TextOCVP.from_pretrained(args.out / "checkpoint").config.stage == "predictor"
+
+
+def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(run):
+    args = run(PLACED, "run")
+    for setting, words in (
+        ("text.kind=transformer", r"set predictor\.color_bias=false"),
+        ("predictor.layer=2", r"unknown setting 'predictor\.layer'"),
+        ("predictor.heads=3", "heads"),
+    ):
+        with pytest.raises(training.SettingsError, match=words):
+            train(replace(args, set=(setting,)))
+    larger = replace(PLACED, name="larger", parser=replace(PLACED.parser, image_size=64))
+    build(larger).save_pretrained(args.parser)
+    with pytest.raises(training.SettingsError, match=r"frames of 32 pixels, parser\.image_size is 64"):
+        train(args)
+    assert not list(args.out.glob("slots-*"))
 
 
 def test_nothing_teaches_a_text_encoder_that_nobody_hears(run):
