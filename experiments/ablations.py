@@ -1,6 +1,6 @@
 """Ablations: what each choice of architecture is worth, every one trained from the same slots with as many updates.
 
-    python experiments/ablations.py --runs runs/ablations              # default: about 20 minutes on 2 cores
+    python experiments/ablations.py --runs runs/ablations              # default: about 15 minutes on 2 cores
     python experiments/ablations.py --runs runs/ablations --quick      # a first look
 
     python experiments/train_ablations.py --data data/tabletop-train.h5 --val data/tabletop-val.h5   # trains the runs
@@ -72,7 +72,7 @@ class Sizes:
 
 
 QUICK = Sizes(following=6, unseen=4, acted=2, parsing=3, slots=3, clips=2)
-DEFAULT = Sizes(following=60, unseen=40, acted=20, parsing=30, slots=30, clips=10)
+DEFAULT = Sizes(following=40, unseen=30, acted=20, parsing=20, slots=20, clips=10)
 
 
 @dataclass

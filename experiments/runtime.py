@@ -93,7 +93,7 @@ QUICK = Sizes(
     heavy=16,
     threads=(available_cores(),),
 )
-DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=8.0, drawn=24)
+DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=5.0, drawn=24)
 
 
 @dataclass

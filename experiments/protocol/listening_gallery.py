@@ -135,7 +135,7 @@ def _words(heard: Heard, text: str, name: str, kind: str) -> Figure:
     for g in there:
         role = GROUPS[g].removeprefix("named ")
         rows.append(f"{colors[role]} {role}" if role in colors else GROUPS[g])
-    caption = f"The {kind} case: mean share over steps, layers and heads. Each row sums to 1, or to less by what special tokens get."
+    caption = f"The {kind} case: mean share over steps, layers and heads."
     return heat_map(
         name, map_GW[there], rows, list(spoken(text)), label="attention to words", caption=caption
     )

@@ -72,7 +72,8 @@ def build_report(
     here = [outcome for outcome in outcomes if outcome.scene.split == split]
     often = Section(
         "How often does the named thing listen most?",
-        "Every slot divides its attention among the words: its shares sum to 1, or to less by what a text encoder's special tokens get. A slot attends most to a word if its "
+        "Every slot divides its attention among the words: its shares sum to 1, or to less by what a text encoder's "
+        "special tokens get. A slot attends most to a word if its "
         "share for that word is larger than that of every other slot that is present, table included; equal is not "
         "more. Shares are averaged over steps, layers and heads first. A colour is one word, whatever the encoder "
         "makes of it. A named thing that the parser gave no slot counts as a miss. New names: the scenes with unseen "
@@ -206,7 +207,7 @@ def _mean_map(outcomes: Sequence[ListeningOutcome]) -> Figure:
 def _map(name: str, heard: Sequence, what: str) -> Figure:
     map_GW = _nanmean(np.stack([one.map_nhGW for one in heard])).mean((0, 1))
     there = [g for g in range(len(GROUPS)) if not np.isnan(map_GW[g]).any()]
-    caption = f"Mean over scenes, instructions, steps, layers and heads ({what}). Each row sums to 1, or to less by what special tokens get."
+    caption = f"Mean over scenes, instructions, steps, layers and heads ({what})."
     return heat_map(
         name,
         map_GW[there],

@@ -58,7 +58,10 @@ def test_figures_of_what_is_there(results: Path) -> None:
     data = json.loads((results / "results.json").read_text())
     assert data["study"] == "ablations" and data["quick"] is True
     assert set(name for name in data["versions"] if name.startswith("run ")) == {"run base"}
-    assert {row["method"] for row in data["rows"]} == {"shipped", "base", slots_name(4), slots_name(12)}
+    models, controls = {"shipped", "base"}, {"random candidate", "expert"}
+    assert {r["method"] for r in data["rows"]} == models | controls | {slots_name(4), slots_name(12)}
+    acted = {r["method"] for r in data["rows"] if r["metric"] == "closed_loop_success"}
+    assert acted == models | controls
     found = {(r["method"], r["split"], r["variant"], r["metric"]): r["value"] for r in data["rows"]}
     # The same weights give the same figures, and the trained number of slots is that of the shipped model.
     for (method, *rest), value in found.items():
@@ -129,4 +132,4 @@ def test_the_plot_shows_the_columns_that_it_names(runs: Path) -> None:
 def test_a_table_without_any_figure_is_a_table(tmp_path: Path) -> None:
     found, _ = look(tmp_path)
     table = predictor_table([], found, "text")
-    assert [row.cells[0].text for row in table.rows] == ["\u2013", *["not trained"] * 4]
+    assert [row.cells[0].text for row in table.rows] == ["\u2013", *["not trained"] * 4, "\u2013", "\u2013"]

@@ -16,7 +16,7 @@ class Args(StudyArgs):
 
 @pytest.mark.parametrize("bad", [{"workers": -1}, {"seed": -1}])
 def test_numbers_out_of_range_are_refused(bad: dict) -> None:
-    with pytest.raises(UsageError, match="must be at least 0, got -1"):
+    with pytest.raises(UsageError, match=r"must be .*, got -1"):
         Args(**bad)
 
 
