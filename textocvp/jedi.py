@@ -119,7 +119,7 @@ class VJepaFeatures:
         config = self.model.config
         T = films_NT3HW.shape[1]
         moments = torch.linspace(0, T - 1, config.frames_per_clip).round().long()
-        frames = films_NT3HW[:, moments].float()
+        frames = films_NT3HW[:, moments].float().to(self.model.device)
         size = (config.crop_size, config.crop_size)
         flat = F.interpolate(frames.flatten(0, 1), size=size, mode="bicubic", antialias=True).clamp(0, 1)
         mean, deviation = (flat.new_tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
@@ -131,7 +131,7 @@ class VJepaFeatures:
         for film in pixels:
             tokens_1ND = encoder(pixel_values_videos=film[None], skip_predictor=True).last_hidden_state
             found.append(tokens_1ND.mean(dim=1) if probe is None else probe(tokens_1ND))
-        return torch.cat(found)
+        return torch.cat(found).cpu()
 
 
 def load_vjepa(name_or_folder: str | Path = VJEPA) -> VJepaFeatures:

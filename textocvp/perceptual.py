@@ -77,8 +77,8 @@ class PerceptualDistance:
 
     @torch.no_grad()
     def features(self, frames_T3HW: Tensor) -> Features:
-        """Features of frames (T, 3, H, W) in 0..1."""
-        return Features(tuple(self.network.features(frames_T3HW.float() * 2 - 1)))
+        """Features of frames (T, 3, H, W) in 0..1, computed on the CPU, where the networks are loaded."""
+        return Features(tuple(self.network.features(frames_T3HW.float().cpu() * 2 - 1)))
 
     @torch.no_grad()
     def compare(self, imagined: Features, real: Features) -> Tensor:

@@ -12,7 +12,7 @@ from planning import (
     ground,
     ground_privileged,
 )
-from planning.grounding import COLORS, ROBOT_COLOR, color_distance
+from planning.grounding import COLORS, ROBOT_COLOR, color_distance, hard_masks
 from tests.planning.conftest import thing
 from tests.planning.oracle import ARM, BACKGROUND, OracleWorldModel
 from textocvp.rollout import Rollout
@@ -119,3 +119,11 @@ def test_goal_reached_by_sight(objects, camera: PinholeCamera) -> None:
     for x, y in ((0.60 + 0.11, -0.10), (0.60 - 0.11, -0.10), (0.60, -0.20), (0.42, 0.08)):
         objects[0] = thing("block", "red", x, y)
         assert not reached()
+
+
+def test_masks_become_hard_where_they_are() -> None:
+    masks = torch.rand(2, 5, 3, 8, 8)
+    assert torch.equal(hard_masks(masks).float().argmax(-3), masks.argmax(-3))
+    # A model on another device gives masks that are there.
+    elsewhere = hard_masks(torch.empty(2, 5, 3, 8, 8, device="meta"))
+    assert elsewhere.device.type == "meta" and elsewhere.dtype == torch.bool
