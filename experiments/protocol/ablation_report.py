@@ -77,7 +77,7 @@ def predictor_table(
         if one.run.stage == "predictor" and (group is None or one.run.group in ("reference", group))
     ]
     columns = (*FOLLOWING, *picture_columns(rows))
-    note = "the checkpoint in this package: trained several times as long"
+    note = "the checkpoint that the study is told, by default the one in this package: trained several times as long"
     table = _table(title, rows, columns, [(SHIPPED, SHIPPED, note, None), *map(_line, runs)])
     controls: list[Line] = [
         ("random candidate", "random candidate", "a robot that follows a random instruction", None),

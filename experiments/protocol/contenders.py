@@ -62,8 +62,8 @@ BASELINES = (
         "non-oc-small",
         False,
         "text, but one vector for the whole scene",
-        f"textocvp train parser --preset non-oc-small {_DATA} --out runs/non-oc-parser --steps 5000 --clip 3 --stride 8 "
-        "--batch 16 --learning-rate 2e-3 && "
+        f"textocvp train parser --preset non-oc-small {_DATA} --out runs/non-oc-parser --steps 5000 --clip 3 "
+        "--stride 8 --batch 16 --learning-rate 2e-3 && "
         f"textocvp train predictor --parser runs/non-oc-parser/checkpoint {_DATA} --out runs/non-oc "
         "--autoregressive 1.0 --content-weight 1 --image-weight 10 --image-frames 2 --steps 1800",
     ),
