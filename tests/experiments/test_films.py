@@ -139,7 +139,8 @@ def test_a_clip_shows_everybody_above_their_masks(worker: Worker) -> None:
 
 
 def test_no_case_is_among_the_best_and_the_worst() -> None:
-    assert extremes("abcde", [3, 1, 5, 2, 4], 10) == (["b", "d"], ["c", "e"])
+    assert extremes("abcde", [3, 1, 5, 2, 4], 10) == (["b", "d", "a"], ["c", "e"])
+    assert extremes("a", [3], 10) == (["a"], [])
     assert extremes("abcde", [3, 1, 5, 2, 4], 1) == (["b"], ["c"])
     assert extremes("a", [1.0], 3) == ([], [])
 
