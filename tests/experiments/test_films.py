@@ -142,7 +142,6 @@ def test_no_case_is_among_the_best_and_the_worst() -> None:
     assert extremes("abcde", [3, 1, 5, 2, 4], 10) == (["b", "d", "a"], ["c", "e"])
     assert extremes("a", [3], 10) == (["a"], [])
     assert extremes("abcde", [3, 1, 5, 2, 4], 1) == (["b"], ["c"])
-    assert extremes("a", [1.0], 3) == ([], [])
 
 
 def test_a_baseline_that_is_not_trained_is_absent_with_the_command(tmp_path) -> None:
