@@ -53,6 +53,14 @@ _LOOP = (
     ("three_steps", "three steps"),
 )
 
+_HEARD = (
+    ("test", "original"),
+    ("controllability", "variants mean"),
+    ("unseen_colors", "original"),
+    ("unseen_colors", "new names"),
+)
+_LISTENERS = ("ours", "colour term off", "wrong sentence", "chance")
+
 STUDIES = (
     Study(
         "controllability",
@@ -139,6 +147,10 @@ STUDIES = (
         "interpretability",
         "Interpretability",
         "Does the slot of the thing that a sentence names attend to the word that names it?",
+        picks=(
+            Pick("named block attends most to its colour word", "attends_block", _HEARD, _LISTENERS),
+            Pick("named bowl attends most to its colour word", "attends_bowl", _HEARD, _LISTENERS),
+        ),
     ),
     Study(
         "runtime",
