@@ -67,8 +67,8 @@ class Sizes:
 
     Attributes:
         frames, batches: of the measurements.
-        repeats: rounds of each measurement. seconds: that a measurement may take before it is cut short (to 3 rounds
-            at least).
+        repeats: rounds of each measurement. seconds: for all models together; what has used its share of them is
+            measured 3 times only.
         drawn: at the paper's sizes, at most so many frames (of all scenes together) are drawn, as that takes half a
             second each.
         heavy: frames of all scenes together, at most, for what is slower than the shipped model by far.
@@ -93,7 +93,7 @@ QUICK = Sizes(
     heavy=16,
     threads=(available_cores(),),
 )
-DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=5.0, drawn=24)
+DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=6.0, drawn=24)
 
 
 @dataclass

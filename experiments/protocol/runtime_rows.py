@@ -56,13 +56,14 @@ def ratio_rows(seconds: Timings, queries: Mapping[int, Mapping[str, np.ndarray]]
         other = None if against in (None, name) else seconds.get((against, cell))
         if other is not None:
             where = f"{cell.phase}, {cell.frames} x {cell.batch}"
-            rows.append(
-                _row(f"{name} / {against}", threads_word(cell.threads), where, "ratio", taken / other)
-            )
+            both = min(len(taken), len(other))  # the rounds in which both took part
+            ratio = taken[:both] / other[:both]
+            rows.append(_row(f"{name} / {against}", threads_word(cell.threads), where, "ratio", ratio))
         rows += _own_ratios(name, cell, seconds)
     for count, timed in queries.items():
         if {OURS, WINDOW} <= set(timed):
-            ratio = timed[WINDOW] / timed[OURS]
+            both = min(len(timed[WINDOW]), len(timed[OURS]))
+            ratio = timed[WINDOW][:both] / timed[OURS][:both]
             rows.append(_row(f"{WINDOW} / {OURS}", threads_word(count), QUERY, "ratio", ratio))
     return rows
 

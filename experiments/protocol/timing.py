@@ -28,31 +28,33 @@ def race(
     """Seconds of each piece of work in each round, after one round that does not count.
 
     In every round each has its turn, starting with another one, so that whatever else the machine does meets all of
-    them alike and the ratio of two of them in one round means something.
+    them alike and the ratio of two of them in one round means something. What takes long drops out early, so that it
+    does not cut short what is quick.
 
     Args:
         works: name -> what to do.
         repeats: rounds to make.
-        seconds: no round after the third is started once all have taken this long together.
+        seconds: for all together. What has used its equal share of it takes no part in rounds after the third.
         clock: gives the time in seconds.
 
     Returns:
-        name -> (rounds,) seconds.
+        name -> (rounds,) seconds, of the first rounds, as many as it took part in.
     """
-    names = list(works)
-    for name in names:
-        works[name]()
-    rounds: list[dict[str, float]] = []
-    began = clock()
-    while len(rounds) < repeats and (len(rounds) < FEWEST or clock() - began < seconds):
-        turn = len(rounds) % max(1, len(names))
-        taken = {}
-        for name in names[turn:] + names[:turn]:
+    for work in works.values():
+        work()
+    taken: dict[str, list[float]] = {name: [] for name in works}
+    for number in range(repeats):
+        running = [
+            name
+            for name, rounds in taken.items()
+            if len(rounds) == number and (number < FEWEST or sum(rounds) < seconds / len(works))
+        ]
+        turn = number % max(1, len(running))
+        for name in running[turn:] + running[:turn]:
             start = clock()
             works[name]()
-            taken[name] = clock() - start
-        rounds.append(taken)
-    return {name: np.array([one[name] for one in rounds]) for name in names}
+            taken[name].append(clock() - start)
+    return {name: np.array(rounds) for name, rounds in taken.items()}
 
 
 def median_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:

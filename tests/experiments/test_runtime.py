@@ -45,6 +45,16 @@ def test_slow_work_is_cut_short_after_three_rounds() -> None:
     assert len(race({"a": watch.takes("a", 10.0)}, 20, 100, watch)["a"]) == 10
 
 
+def test_slow_work_does_not_cut_short_what_is_quick() -> None:
+    watch = Watch()
+    timed = race({"slow": watch.takes("a", 50.0), "quick": watch.takes("b", 2.0)}, 15, 100, watch)
+    assert {name: len(rounds) for name, rounds in timed.items()} == {"slow": 3, "quick": 15}
+    cell = Cell("predict", 9, 1, 1)
+    rows = ratio_rows({(OURS, cell): timed["quick"], (WINDOW, cell): timed["slow"]}, {})
+    (ratio,) = [row for row in rows if row.method == f"{WINDOW} / {OURS}"]
+    assert (ratio.value, ratio.n) == (25.0, 3)
+
+
 def test_the_median_has_an_interval_of_order_statistics() -> None:
     # n = 15: the 4th smallest to the 4th largest cover 96.5 % (textbook table of the sign test).
     interval = median_interval(np.arange(15.0)[::-1])
