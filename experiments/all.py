@@ -1,7 +1,7 @@
 """All studies, one after another, and one page that links their reports.
 
-    python experiments/all.py                    # hours on 2 cores; stop it and start it again as you like
-    python experiments/all.py --quick            # first looks, about 20 minutes
+    python experiments/all.py                    # under an hour on 2 cores; stop it and start it again as you like
+    python experiments/all.py --quick            # first looks, about 7 minutes
     python experiments/all.py --only runtime --only long_horizon --fresh
 
 A study that this program has run is not run again while its command line, all weights that it reads and the code of
