@@ -32,9 +32,9 @@ FOLLOWING: tuple[Column, ...] = (
     ("three other bowls", "controllability", "variants mean", ENDS, 2),
     ("wrong text", "controllability", "wrong text", ENDS, 2),
     ("unseen colours", "unseen_colors", "original", ENDS, 2),
+    ("carried out", "controllability", "original", "closed_loop_success", 2),
     ("original, strict", "controllability", "original", "predicted_success", 2),
     ("other bowls, strict", "controllability", "variants mean", "predicted_success", 2),
-    ("carried out", "controllability", "original", "closed_loop_success", 2),
 )
 PARSING: tuple[Column, ...] = (
     ("mIoU", "test", "true frames", "miou", 3),
