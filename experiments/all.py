@@ -53,11 +53,6 @@ class Args(StudyArgs):
     runs: Path = Path("runs/ablations")
     """Folder of the ablation runs."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.quick and self.out == Path("quick") / "results":
-            self.out = Path("results") / "quick"
-
 
 @dataclass(frozen=True)
 class Outcome:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from experiments.protocol.arguments import StudyArgs, UsageError, start
 from experiments.protocol.contenders import FAR, Contender, LoadVideo, LoadVideoModel, find_contenders, hashes
-from experiments.protocol.film_gallery import FilmPicture, extremes
+from experiments.protocol.film_gallery import FilmPicture, extremes, halves
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.prediction import (
     LENGTHS,
@@ -139,8 +139,7 @@ def main(
         clips = list(progress.track("pictures", pool.run(pictures)))
     seeds = {"slots": [args.seed], "scenes": [unit.scene.seed for unit in units]}
     results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
-    best = (len(clips) + 1) // 2
-    report = build_report(results, contenders, absent, measures, clips[:best], clips[best:], run.command)
+    report = build_report(results, contenders, absent, measures, *halves(clips), run.command)
     run.write(report)
     tables = [paper_table(rows, absent), episode_table(rows, absent), upper_table(rows, absent, measures)]
     run.close(progress, results, tables, [*(one.text for one in absent), measures.absent])

@@ -19,7 +19,7 @@ from pathlib import Path
 from experiments.protocol.arguments import StudyArgs, UsageError, start
 from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome
 from experiments.protocol.contenders import Contender, LoadVideo, LoadVideoModel, find_contenders, hashes
-from experiments.protocol.film_gallery import FilmPicture, extremes
+from experiments.protocol.film_gallery import FilmPicture, extremes, halves
 from experiments.protocol.frame_scores import METRICS, Measures, available_measures
 from experiments.protocol.gallery import choose_loop
 from experiments.protocol.predicted import HORIZON
@@ -170,8 +170,7 @@ def main(
         pictures = list(progress.track("robot's films", pool.run(robot)))
     seeds = {"slots": [args.seed], **_seeds(scenes, episodes)}
     results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
-    half = (len(clips) + 1) // 2
-    report = build_report(results, absent, measures, clips[:half], clips[half:], pictures, run.command)
+    report = build_report(results, absent, measures, *halves(clips), pictures, run.command)
     run.write(report)
     tables = [
         table

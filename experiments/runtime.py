@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -51,7 +52,7 @@ from experiments.protocol.runtime_subjects import (
 )
 from experiments.protocol.scenes import draw, test_scenes
 from experiments.protocol.timing import machine_in_words, other_load, race
-from experiments.protocol.workers import LoadCheckpoint, available_cores
+from experiments.protocol.workers import available_cores
 from experiments.reporting import Results, StudyProgress
 from planning import AppearanceGrounder, Instruction, PinholeCamera
 from textocvp.mage.video import MageVideoModel
@@ -122,9 +123,9 @@ def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
         OSError: if the folder cannot be written, before any work is done.
         CheckpointError: if there is no such checkpoint, before any work is done.
     """
-    load = LoadCheckpoint(args.checkpoint)
-    run, sizes = StudyRun.open("runtime", args, load), sizes or (QUICK if args.quick else DEFAULT)
-    world_model, busy = load(), other_load()
+    run, sizes = StudyRun.open("runtime", args), sizes or (QUICK if args.quick else DEFAULT)
+    # A checkpoint's, so that it is more than what the other studies ask for.
+    world_model, busy = cast(WorldModel, run.world_model), other_load()
     scenes = look(args.seed, max(sizes.batches))
     subjects, absent = all_subjects(world_model, scenes, sizes.drawn if paper else 0)
     threads = sizes.threads

@@ -189,10 +189,8 @@ def _rollout(command: RolloutCommand) -> None:
         raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
     try:
         world_model = WorldModel.from_pretrained(command.checkpoint, command.device)
-    except (
-        RuntimeError,
-        AssertionError,
-    ) as error:  # what torch says of a device that it does not know or have
+    # What torch raises for a device that it does not know or have.
+    except (RuntimeError, AssertionError) as error:
         raise Mistake(f"--device {command.device} cannot be used: {error}") from error
     H, W = world_model.image_size
     if command.resize:

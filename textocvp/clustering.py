@@ -52,7 +52,7 @@ def color_features(colors: Tensor) -> Tensor:
 
 def squared_distances(a: Tensor, b: Tensor) -> Tensor:
     """(B, N, M) squared Euclidean distances between a (B, N, C) and b (B, M, C)."""
-    with full_precision(a):
+    with full_precision(a.device):
         a, b = a.float(), b.float()
         cross = a @ b.transpose(1, 2)
     return (a.square().sum(-1, keepdim=True) + b.square().sum(-1)[:, None] - 2 * cross).clamp_min(0)

@@ -133,7 +133,7 @@ def moments(masks: Tensor) -> tuple[Tensor, Tensor]:
     """Centre of mass and standard deviation, each (B, K, 2) as (x, y) in -1..1, of masks (B, K, H, W)."""
     grid_N2 = pixel_grid(masks.shape[-2], masks.shape[-1], device=masks.device).flatten(0, 1)
     # The difference of squares of a small thing far from the centre is lost in 8 bits.
-    with full_precision(masks):
+    with full_precision(masks.device):
         masks = masks.float()
         weights_BKN = masks.flatten(2) / masks.sum((2, 3))[..., None].clamp_min(1e-6)
         position = weights_BKN @ grid_N2

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from textocvp.config import TextConfig
+from textocvp.precision import full_precision
 from textocvp.text import RGB, TextEncoder, TextTokens, WordBatch
 from textocvp.text_weights import (
     CONFIG_FILE,
@@ -62,7 +63,7 @@ class FrozenStates:
             return self._known[ids]
         ids_1L = torch.tensor([ids], device=device)
         # What is kept must not depend on the precision of the training step that asks first.
-        with torch.autocast(device.type, enabled=False):
+        with full_precision(device):
             states_1LC = states(self.encoder.to(device), ids_1L, torch.ones_like(ids_1L))
         self.computed += 1
         self._known[ids] = states_1LC[0].cpu()

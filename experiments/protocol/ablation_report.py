@@ -8,6 +8,7 @@ from dataclasses import replace
 from experiments.protocol.ablation_rows import PICTURES, SHIPPED, slots_name
 from experiments.protocol.ablation_runs import FoundRun
 from experiments.protocol.ablation_scenes import ENDS, NEAR
+from experiments.protocol.film_gallery import halves
 from experiments.protocol.frame_scores import METRICS, Measures
 from experiments.reporting import (
     Card,
@@ -171,16 +172,16 @@ def build_report(
         f"{intro} {measures.absent}",
         [*tables, *predictor_plot(rows, found)],
     )
-    half = (len(clips) + 1) // 2
+    best, worst = halves(clips)
     films = [
         Section(
             f"Imagined beside real, {title}",
             "Pictures above masks, one colour a thing; named are the shipped model (ours) and one run of each kind.",
-            [Clips(list(some))],
+            [Clips(some)],
         )
         for title, some in (
-            ("where most runs reach the bowl", clips[:half]),
-            ("where fewest do", clips[half:]),
+            ("where most runs reach the bowl", best),
+            ("where fewest do", worst),
         )
         if some
     ]

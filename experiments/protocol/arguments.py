@@ -12,6 +12,8 @@ import tyro
 
 from textocvp.model import CheckpointError
 
+#: Where every study writes by default.
+RESULTS = Path("results")
 #: Each seed has scenes of its own, and a split has so many.
 LARGEST_SEED = 999
 
@@ -46,7 +48,7 @@ class StudyArgs:
             raise UsageError(f"--seed must be 0 to {LARGEST_SEED}, got {self.seed}")
         if self.quick and self.out == type(self).out:
             # A first look must not take the place of figures that took hours.
-            self.out = self.out.parent / "quick" / self.out.name
+            self.out = RESULTS / "quick" / self.out.relative_to(RESULTS)
 
     def command(self, study: str) -> str:
         """What to type for the same figures: every argument that changes them and is not at its default.

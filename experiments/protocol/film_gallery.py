@@ -69,6 +69,12 @@ class FilmPicture:
         )
 
 
+def halves(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+    """Clips of the best cases and of the worst ones, of both as `extremes` chose them, one after the other."""
+    best = (len(clips) + 1) // 2
+    return list(clips[:best]), list(clips[best:])
+
+
 def extremes(cases: Sequence[T], badness: Sequence[float], count: int) -> tuple[list[T], list[T]]:
     """The `count` best cases and the `count` worst ones, most extreme first; no case is both. Of an odd number of cases
     too few for all, the best have one more.

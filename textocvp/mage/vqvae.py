@@ -48,7 +48,7 @@ class Codebook(nn.Module):
     def distances(self, features_XC: Tensor) -> Tensor:
         """Squared distances (X, K) of features (X, C) to the codes."""
         # In full precision also where the rest is not: codes lie close to each other.
-        with full_precision(features_XC):
+        with full_precision(features_XC.device):
             features_XC = features_XC.detach().float()
             cross_XK = features_XC @ self.codes_KC.T
             return features_XC.square().sum(1, keepdim=True) - 2 * cross_XK + self.codes_KC.square().sum(1)
