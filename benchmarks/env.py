@@ -24,7 +24,7 @@ import tyro
 import envs
 from envs.collection import collect
 from envs.episode import EpisodeConfig
-from textocvp.episodes import EpisodeFile
+from textocvp.data.episodes import EpisodeFile
 
 LINKS = 7
 TRIANGLES = 16_000

@@ -26,9 +26,9 @@ import tyro
 import envs  # noqa: F401 (registers the environments)
 from planning.planners import watched_frames
 from planning.thresholds import THRESHOLDS
-from textocvp.config import preset
 from textocvp.model import TextOCVP
-from textocvp.predictor import Predictor
+from textocvp.predictors.textocvp import Predictor
+from textocvp.presets import preset
 from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel, bundled_checkpoints
 

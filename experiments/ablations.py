@@ -45,7 +45,7 @@ from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import LoadCheckpoint
 from experiments.reporting import Results, StudyProgress
-from textocvp.model import CheckpointError
+from textocvp.checkpoint import CheckpointError
 
 VARIANTS = 3
 SHOWN = ("base", "layers-1", "residual-off", "lexicon-no-bias")

@@ -36,7 +36,7 @@ from planning import (
 )
 from planning.grounding import BOWL_WIDTH, COLORS, ROBOT_COLOR, TABLE_COLOR, apparent_width, color_distance
 from planning.scores import centroids
-from textocvp.episodes import EpisodeFile
+from textocvp.data.episodes import EpisodeFile
 
 ARM, FIRST_OBJECT = 1, 2  # labels of a segmentation
 PALETTE = {**COLORS, "robot": ROBOT_COLOR, "table": TABLE_COLOR}

@@ -34,7 +34,7 @@ from experiments.protocol.running import StudyRun
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import LoadWorldModel
 from experiments.reporting import Results, Row, StudyProgress
-from textocvp.jedi import VJEPA
+from textocvp.metrics.jedi import VJEPA
 
 # Who is in the headline figures, by the ending of their names.
 NAMED = {

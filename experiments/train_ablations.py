@@ -36,16 +36,17 @@ from experiments.protocol.ablation_runs import (
     run_named,
 )
 from experiments.reporting import Cell, Table, TableRow
-from textocvp.episodes import EpisodeFile
-from textocvp.model import CheckpointError, TextOCVP
-from textocvp.slot_cache import SlotCacheError, cached_slots
-from textocvp.train_parser import ParserTraining
-from textocvp.train_parser import train as train_parser
-from textocvp.train_predictor import PredictorTraining
-from textocvp.train_predictor import train as train_predictor
+from textocvp.checkpoint import CheckpointError
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.slot_cache import SlotCacheError, cached_slots
+from textocvp.model import TextOCVP
+from textocvp.training.parser import ParserTraining
+from textocvp.training.parser import train as train_parser
+from textocvp.training.predictor import PredictorTraining
+from textocvp.training.predictor import train as train_predictor
 from textocvp.world_model import DEFAULT_CHECKPOINT, bundled_checkpoints
 
-SLOTS = ("slots-train.h5", "slots-val.h5")  # as `textocvp.train_predictor` names them
+SLOTS = ("slots-train.h5", "slots-val.h5")  # as `textocvp.training.predictor` names them
 
 
 @dataclass

@@ -12,14 +12,21 @@ from typing import Literal
 import torch
 from torch import nn
 
-from textocvp.config import PRESETS, ModelConfig
-from textocvp.dino import DINO_HUB_ID
-from textocvp.located import DEFAULT_CHECKPOINT, bundled_checkpoints, located
-from textocvp.mage.config import ARCHITECTURE as MAGE
-from textocvp.mage.config import MAGE_PRESETS, MageConfig
-from textocvp.mage.model import Mage
-from textocvp.model import TextOCVP, read_config, read_json
-from textocvp.text_weights import MINILM_PACKAGE, T5_HUB_ID
+from textocvp.baselines.mage.config import ARCHITECTURE as MAGE
+from textocvp.baselines.mage.config import MAGE_PRESETS, MageConfig
+from textocvp.baselines.mage.model import Mage
+from textocvp.checkpoint import (
+    DEFAULT_CHECKPOINT,
+    bundled_checkpoints,
+    read_config,
+    read_json,
+    resolve_checkpoint,
+)
+from textocvp.config import ModelConfig
+from textocvp.model import TextOCVP
+from textocvp.parsers.dino import DINO_HUB_ID
+from textocvp.presets import PRESETS
+from textocvp.text.pretrained import MINILM_PACKAGE, T5_HUB_ID
 
 State = Literal["trained here", "not trained here", "needs weights", "figures only"]
 
@@ -130,6 +137,6 @@ def _commands(name: str, config: ModelConfig | MageConfig) -> str:
 
 
 def _bundled_config(name: str) -> ModelConfig | MageConfig:
-    with located(name) as folder:
+    with resolve_checkpoint(name) as folder:
         data = read_json(folder)
         return MageConfig.from_dict(data) if data.get("architecture") == MAGE else read_config(folder)

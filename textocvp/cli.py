@@ -16,10 +16,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.config import preset, with_settings
+from textocvp.checkpoint import CONFIG_FILE, CheckpointError
+from textocvp.config import with_settings
 from textocvp.drawing import SUFFIXES
-from textocvp.model import CONFIG_FILE, CheckpointError
-from textocvp.video import load_video_model
+from textocvp.presets import preset
+from textocvp.protocols import load_model
 from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel
 
 
@@ -125,15 +126,16 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load and that the other commands
     # never use.
-    from textocvp import train_parser, train_predictor
-    from textocvp.dino import DinoWeightsError
-    from textocvp.episodes import EpisodeFile
-    from textocvp.feature_cache import FeatureCacheError
-    from textocvp.mage import train_mage, train_vqvae
-    from textocvp.mage.config import mage_preset
-    from textocvp.slot_cache import SlotCacheError
-    from textocvp.text_weights import TextWeightsError
-    from textocvp.training import SettingsError
+    from textocvp.baselines.mage import train_mage, train_vqvae
+    from textocvp.baselines.mage.config import mage_preset
+    from textocvp.data.episodes import EpisodeFile
+    from textocvp.data.feature_cache import FeatureCacheError
+    from textocvp.data.slot_cache import SlotCacheError
+    from textocvp.parsers.dino import DinoWeightsError
+    from textocvp.text.pretrained import TextWeightsError
+    from textocvp.training import parser as train_parser
+    from textocvp.training import predictor as train_predictor
+    from textocvp.training.run import SettingsError
 
     Stage = Union[  # noqa: UP007
         Annotated[train_parser.ParserTraining, tyro.conf.subcommand("parser")],
@@ -218,7 +220,7 @@ def _info(command: InfoCommand) -> None:
         _models()
         return
     console = Console()
-    loaded: Any = load_video_model(command.checkpoint)
+    loaded: Any = load_model(command.checkpoint)
     model = loaded.model
     console.print(f"[bold]{loaded.checkpoint.name}[/bold]  {loaded!r}", highlight=False)
     if loaded.checkpoint.sha256:

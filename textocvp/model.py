@@ -14,28 +14,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from huggingface_hub import PyTorchModelHubMixin, snapshot_download
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from huggingface_hub import PyTorchModelHubMixin
+from safetensors.torch import save_file
+from torch import nn
 
+from textocvp.checkpoint import (
+    CONFIG_FILE,
+    TEXT_FOLDER,
+    WEIGHTS_FILE,
+    CheckpointError,
+    checkpoint_folder,
+    load_weights,
+    read_config,
+)
 from textocvp.config import ModelConfig
-from textocvp.feature_renderer import check_features
-from textocvp.parser import build_parser
-from textocvp.predictor import build_predictor
-from textocvp.renderer import build_renderer
+from textocvp.parsers import build_parser
+from textocvp.predictors import build_predictor
+from textocvp.renderers import build_renderer
 from textocvp.text import build_text_encoder
-
-CONFIG_FILE = "config.json"
-WEIGHTS_FILE = "model.safetensors"
-TEXT_FOLDER = "text"  # only where a fine-tuned text encoder needs it
-
-
-class CheckpointError(ValueError):
-    """A checkpoint is missing, damaged, or made for another model; the message says which part and why."""
 
 
 class TextOCVP(
@@ -141,111 +139,19 @@ def evaluating(model: nn.Module) -> Iterator[None]:
             module.training = True
 
 
-def checkpoint_folder(name: str | Path, **hub: Any) -> Path:
-    """The folder of that name, or the one into which the repository `name` of the Hugging Face hub was fetched.
-
-    Args:
-        hub: as in `huggingface_hub.snapshot_download`.
-
-    Raises:
-        CheckpointError: if there is neither.
-    """
-    folder = Path(name)
-    if folder.is_dir():
-        return folder
-    try:
-        patterns = [CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"]
-        return Path(snapshot_download(str(name), allow_patterns=patterns, **hub))
-    # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
-    except Exception as error:
-        raise CheckpointError(
-            f"{str(name)!r} is no folder here, and fetching it from the Hugging Face hub failed: "
-            f"{type(error).__name__}: {error}"
-        ) from error
-
-
-def read_config(folder: Path) -> ModelConfig:
-    """The configuration of the checkpoint in `folder`.
-
-    Raises:
-        CheckpointError: if there is no readable `config.json` there, it is of another architecture, or a field is
-            unknown or missing.
-    """
-    data = read_json(folder)
-    if data.get("architecture") == "mage-vqvae":
-        raise CheckpointError(
-            f"{folder} holds a VQ-VAE, which imagines nothing: `textocvp train mage --vqvae {folder}` makes a MAGE "
-            "of it"
+def check_features(config: ModelConfig) -> None:
+    """Raise a ValueError where renderer and parser do not speak of the same features; the message says what to set."""
+    parser, renderer = config.parser, config.renderer
+    if renderer.kind != "features":
+        return
+    if parser.encoder != "dinov2" or parser.corrector != "slot_attention":
+        raise ValueError(
+            "renderer.kind 'features' redraws the features of a frozen encoder: set parser.encoder=dinov2 and "
+            "parser.corrector=slot_attention"
         )
-    if "architecture" in data:
-        raise CheckpointError(
-            f"{folder} holds a {data['architecture']!r} model, which has no slots: load it with "
-            "textocvp.video.load_video_model"
-        )
-    try:
-        return ModelConfig.from_dict(data)
-    except ValueError as error:
-        raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-
-
-def read_json(folder: Path) -> dict[str, Any]:
-    """What `config.json` of the checkpoint in `folder` holds, whatever its architecture.
-
-    Raises:
-        CheckpointError: if there is no readable `config.json` there.
-    """
-    path = folder / CONFIG_FILE
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and "
-            f"{WEIGHTS_FILE}"
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from error
-    if not isinstance(data, dict):
-        raise CheckpointError(f"{path} is damaged: it must hold one JSON object, not a {type(data).__name__}")
-    return data
-
-
-def load_weights(model: nn.Module, path: Path) -> None:
-    """Copy every tensor of a safetensors file into the model.
-
-    Raises:
-        CheckpointError: if the file is missing or damaged, or its tensors are not exactly the model's in
-            name, shape and kind of number.
-    """
-    try:
-        found = load_file(path)
-    except FileNotFoundError:
-        raise CheckpointError(f"{path.parent} is no checkpoint: there is no {path.name}") from None
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from error
-    wanted = model.state_dict()
-    for problem, names in (
-        ("lacks", wanted.keys() - found.keys()),
-        ("has what the model does not:", found.keys() - wanted.keys()),
+    for name, has, wanted in (
+        ("renderer.feature_dim", renderer.feature_dim, parser.encoder_dim),
+        ("renderer.patches", renderer.patches, parser.image_size // parser.encoder_patch),
     ):
-        if names:
-            raise CheckpointError(f"{path} {problem} {_listed(sorted(names))}")
-    for name, tensor in wanted.items():
-        if _kind(found[name]) != _kind(tensor):
-            raise CheckpointError(
-                f"{path}: tensor {name!r} is {_described(found[name])}, the model's is {_described(tensor)}"
-            )
-    model.load_state_dict(found, strict=True)
-
-
-def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
-    # Weights may be stored in a shorter float; integers and floats must not be mixed up.
-    return tensor.shape, tensor.is_floating_point()
-
-
-def _described(tensor: Tensor) -> str:
-    return f"{tuple(tensor.shape)} {str(tensor.dtype).removeprefix('torch.')}"
-
-
-def _listed(names: list[str], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"tensor{'s' if len(names) > 1 else ''} {', '.join(map(repr, names[:most]))}{more}"
+        if has != wanted:
+            raise ValueError(f"{name} is {has}, the encoder's features have {wanted}: set {name}={wanted}")

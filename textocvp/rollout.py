@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from textocvp.drawing import save_film
-from textocvp.renderer import Renderer
-from textocvp.slots import SlotLayout, SlotState, pixel_grid
+from textocvp.layers import pixel_grid
+from textocvp.renderers.base import Renderer
+from textocvp.slots import SlotLayout, SlotState
 
 #: How many pictures the renderer draws at once: large enough to keep two cores busy, small enough for the
 #: cache.

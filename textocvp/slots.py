@@ -13,6 +13,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from textocvp.layers import full_precision, pixel_grid
+
+PRESENCE_BACKGROUND = 2.0
+"""Value of a slot's presence that marks it as the canvas behind everything (1 is a thing, 0 an unused slot)."""
+
+MIN_SCALE = 0.012
+"""Smallest standard deviation of a slot, in -1..1: about a third of a pixel at 64x64."""
+
 
 @dataclass(frozen=True)
 class SlotLayout:
@@ -76,16 +84,13 @@ class SlotState:
         return cls(content, color, position, scale, presence)
 
 
-def pixel_grid(height: int, width: int, *, device: torch.device | str | None = None) -> Tensor:
-    """Where the pixel centres lie in the unit of `SlotState.position`.
-
-    The picture's edges are at -1 and 1, so the first of W pixel centres is at 1/W - 1; a position p is at
-    `(p + 1) / 2 * W` pixels, where the first centre is 0.5.
-
-    Returns:
-        (height, width, 2) of (x, y), float32.
-    """
-    y = (torch.arange(height, device=device, dtype=torch.float32) + 0.5) * (2 / height) - 1
-    x = (torch.arange(width, device=device, dtype=torch.float32) + 0.5) * (2 / width) - 1
-    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([grid_x, grid_y], dim=-1)
+def moments(masks: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre of mass and standard deviation, each (B, K, 2) as (x, y) in -1..1, of masks (B, K, H, W)."""
+    grid_N2 = pixel_grid(masks.shape[-2], masks.shape[-1], device=masks.device).flatten(0, 1)
+    # The difference of squares of a small thing far from the centre is lost in 8 bits.
+    with full_precision(masks.device):
+        masks = masks.float()
+        weights_BKN = masks.flatten(2) / masks.sum((2, 3))[..., None].clamp_min(1e-6)
+        position = weights_BKN @ grid_N2
+        variance = weights_BKN @ grid_N2.square() - position.square()
+    return position, variance.clamp_min(MIN_SCALE**2).sqrt()

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.located import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, located
+from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, resolve_checkpoint
+from textocvp.inputs import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
 from textocvp.model import TextOCVP
-from textocvp.parser import Parsed
-from textocvp.requests import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
+from textocvp.parsers.base import Parsed
 from textocvp.rollout import Rollout
 
 __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
@@ -49,7 +49,7 @@ class WorldModel:
                 damaged.
         """
         name = str(name_or_folder_or_hub_id)
-        with located(name) as folder:
+        with resolve_checkpoint(name) as folder:
             return cls(TextOCVP.from_pretrained(folder, device=device), Checkpoint.of(folder, name))
 
     def __repr__(self) -> str:
@@ -148,7 +148,7 @@ class WorldModel:
         seed: int = 0,
         num_slots: int | None = None,
     ) -> Tensor:
-        """Only the frames (B, horizon + 1, 3, H, W) of `rollout`, as every `textocvp.video.VideoModel` gives them."""
+        """Only the frames (B, horizon + 1, 3, H, W) of `rollout`, as every `VideoModel` gives them."""
         return self.rollout(obs, text, horizon=horizon, seed=seed, num_slots=num_slots).frames
 
     @torch.no_grad()

@@ -3,7 +3,7 @@
 One list for both sides: `experiments/train_ablations.py` trains it, `experiments/ablations.py` measures it. All
 predictor runs learn from the slots of one parser, the shipped one, from the same episodes in the same order, with
 the same number of updates; all parser runs share episodes, order and updates likewise. Runs with the lexicon also
-learn from recoloured scenes, which other text encoders cannot (`textocvp.predictor_data`).
+learn from recoloured scenes, which other text encoders cannot (`textocvp.data.slot_batches`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from textocvp.config import ModelConfig, preset, with_settings
-from textocvp.model import CONFIG_FILE, WEIGHTS_FILE, read_config
-from textocvp.training import STEP_FILE
+from textocvp.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
+from textocvp.config import ModelConfig, with_settings
+from textocvp.presets import preset
+from textocvp.training.run import STEP_FILE
 
 Stage = Literal["parser", "predictor"]
 Group = Literal["reference", "depth", "residual", "text", "initializer and decoder"]

@@ -17,8 +17,8 @@ from experiments.protocol.predicted import imagine_and_judge
 from experiments.protocol.scenes import TestScene, draw, play
 from experiments.protocol.workers import LoadCheckpoint, Worker
 from planning import PinholeCamera
-from textocvp.following import PIXEL, REACHED
-from textocvp.metrics import psnr
+from textocvp.metrics.frames import psnr
+from textocvp.training.evaluate_predictor import PIXEL, REACHED
 
 NEAR = REACHED / PIXEL  # pixels of 64
 ENDS = f"ends_within_{NEAR:g}_px"  # the metric: the block's mask ends that near to the bowl's

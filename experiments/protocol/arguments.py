@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import tyro
 
-from textocvp.model import CheckpointError
+from textocvp.checkpoint import CheckpointError
 
 #: Where every study writes by default.
 RESULTS = Path("results")

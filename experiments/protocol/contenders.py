@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from textocvp.model import CheckpointError
-from textocvp.video import VideoModel, load_video_model
+from textocvp.checkpoint import CheckpointError
+from textocvp.protocols import VideoModel, load_model
 
 
 class LoadVideoModel(Protocol):
@@ -25,7 +25,7 @@ class LoadVideo:
     name: str
 
     def __call__(self) -> VideoModel:
-        return load_video_model(self.name)
+        return load_model(self.name)
 
 
 @dataclass(frozen=True)

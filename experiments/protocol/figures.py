@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.reporting import Row
-from textocvp.metrics import Interval, bootstrap_interval, wilson_interval
+from textocvp.metrics.intervals import Interval, bootstrap_interval, wilson_interval
 
 
 def rate_row(method: str, split: str, variant: str, metric: str, success_NR: Any) -> Row:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from experiments.protocol.films import Film
-from textocvp.jedi import VJepaFeatures, load_vjepa
-from textocvp.metrics import psnr, ssim
-from textocvp.perceptual import MetricUnavailable, PerceptualDistance, load_lpips, load_st_lpips
+from textocvp.metrics.frames import psnr, ssim
+from textocvp.metrics.jedi import VJepaFeatures, load_vjepa
+from textocvp.metrics.perceptual import MetricUnavailable, PerceptualDistance, load_lpips, load_st_lpips
 
 #: The second view leaves out the lowest rows of the picture. The robot stands beyond the upper edge, and its arm
 #: reaches this far down in fewer than one frame in a hundred: nearly nothing but still table, which is easy.

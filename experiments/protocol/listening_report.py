@@ -28,7 +28,7 @@ from experiments.reporting.grids import heat_grid
 from experiments.reporting.plots import Series, curve_plot, heat_map, interval_plot
 from experiments.reporting.table import DASH, Kind
 from planning import THRESHOLDS
-from textocvp.metrics import bootstrap_interval
+from textocvp.metrics.intervals import bootstrap_interval
 
 NOTES: dict[str, tuple[Kind, str]] = {
     OURS: ("ours", "slots named by the simulator's segmentation, for measuring only"),

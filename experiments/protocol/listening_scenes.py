@@ -27,7 +27,7 @@ from planning import (
     ground_privileged,
 )
 from textocvp import Rollout, WorldModel
-from textocvp.predictor_layer import color_match
+from textocvp.predictors.textocvp import color_match
 from textocvp.slots import SlotState
 
 

@@ -23,7 +23,7 @@ from experiments.reporting import (
 )
 from experiments.reporting.plots import Series, curve_plot, interval_plot
 from experiments.reporting.table import DASH, Kind
-from textocvp.metrics import bootstrap_interval
+from textocvp.metrics.intervals import bootstrap_interval
 
 SPLIT = "test"
 #: Name in results.json -> field of `MaskScores`.

@@ -11,7 +11,7 @@ from envs import parse_instruction
 from experiments.protocol.scenes import Drawn, TestScene, draw, play, wrong_text
 from experiments.protocol.workers import LoadWorldModel, StudyModel, Worker
 from textocvp import Rollout
-from textocvp.metrics import FIRST_OBJECT, foreground_ari, object_ious, overlaps, slot_labels
+from textocvp.metrics.masks import FIRST_OBJECT, foreground_ari, object_ious, overlaps, slot_labels
 
 ARM = 1  # its label in a segmentation
 #: Lengths of the prediction: the paper's two, a whole episode, and for models that can, far beyond what is trained.

@@ -14,7 +14,7 @@ from experiments.protocol.frame_scores import FrameScores, Measures, Scorer
 from experiments.protocol.scenes import TestScene
 from experiments.protocol.workers import Worker
 from experiments.reporting import Row
-from textocvp.jedi import jedi
+from textocvp.metrics.jedi import jedi
 
 SPLIT = "test"
 #: The paper's two lengths, and a whole episode of the tabletop.

@@ -18,7 +18,7 @@ from experiments.protocol.scenes import TestScene
 from experiments.protocol.workers import Worker
 from experiments.reporting import Row
 from planning import PinholeCamera
-from textocvp.metrics import Interval, ratio_interval, relative_change, wilson_interval
+from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
 #: Split -> name. The first is what the model was trained for; the others are what it was not.
 SPLITS = {"test": "test set", "unseen_colors": "unseen colours", "more_objects": "8 objects"}

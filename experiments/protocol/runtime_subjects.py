@@ -13,13 +13,14 @@ from planning import Grounding, Instruction, Judge, Trace, WeightedSum, measure_
 from planning.planners import watched_frames
 from planning.scores import CarryScore, PlacementScore
 from planning.thresholds import THRESHOLDS
-from textocvp.config import ModelConfig, preset
-from textocvp.mage.config import mage_preset
-from textocvp.mage.model import Mage
-from textocvp.mage.video import MageVideoModel
+from textocvp.baselines.mage.config import mage_preset
+from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
+from textocvp.presets import preset
+from textocvp.protocols import VideoModel
 from textocvp.rollout import Rollout
-from textocvp.video import VideoModel
 from textocvp.world_model import WorldModel
 
 Phase = Literal["encode", "predict", "decode", "all"]

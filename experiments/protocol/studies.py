@@ -11,7 +11,7 @@ from typing import Literal
 
 from experiments.reporting.provenance import checkpoint_record
 from experiments.reporting.summary import Pick
-from textocvp.model import WEIGHTS_FILE
+from textocvp.checkpoint import WEIGHTS_FILE
 from textocvp.world_model import bundled_checkpoints
 
 

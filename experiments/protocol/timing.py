@@ -13,7 +13,7 @@ import torch
 from scipy.stats import binom
 
 from experiments.protocol.workers import available_cores
-from textocvp.metrics import Interval
+from textocvp.metrics.intervals import Interval
 
 FEWEST = 3
 """Rounds that are always made, however long they take."""

@@ -17,7 +17,7 @@ from envs.collect import Args
 from envs.collection import collect
 from envs.episode import EpisodeConfig, record_episode
 from envs.splits import SPLITS
-from textocvp.episodes import EpisodeFile
+from textocvp.data.episodes import EpisodeFile
 
 ROOT = Path(__file__).parents[2]
 # Small enough for CI: 16x16 pixels at 8 frames a second, in pieces of 3 episodes.

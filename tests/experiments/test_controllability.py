@@ -15,7 +15,7 @@ from experiments.protocol.predicted import PredictedScene
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import Worker
 from tests.experiments.oracle import LoadOracle
-from textocvp.model import CheckpointError
+from textocvp.checkpoint import CheckpointError
 
 TINY = Sizes(predicted=1, slot_seeds=2, loop=1, other=0, long=0, controls=1, clips=1)
 HEADLINE = {

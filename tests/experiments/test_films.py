@@ -20,9 +20,9 @@ from experiments.protocol.frame_scores import BOTTOM_ROWS, PSNR_CAP, UPPER, Meas
 from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import Worker
 from tests.experiments.oracle import LoadOracle
-from textocvp.metrics import psnr
-from textocvp.model import CheckpointError
-from textocvp.perceptual import load_st_lpips
+from textocvp.checkpoint import CheckpointError
+from textocvp.metrics.frames import psnr
+from textocvp.metrics.perceptual import load_st_lpips
 from textocvp.world_model import Checkpoint
 
 MEASURES = Measures(("st_lpips",), None, (), ())

@@ -22,8 +22,8 @@ from planning import Grounding, Instruction
 from tests.experiments.listener import HEADS, LAYERS, Listener, LoadListener
 from tests.experiments.oracle import LoadOracle
 from textocvp import WorldModel
-from textocvp.config import PRESETS
 from textocvp.model import TextOCVP
+from textocvp.presets import PRESETS
 from textocvp.rollout import Rollout
 
 TEXT = "put the red block in the blue bowl"

@@ -17,7 +17,7 @@ from experiments.protocol.workers import Worker
 from planning import Instruction
 from tests.experiments.foresight import LoadForesight
 from tests.experiments.oracle import LoadOracle
-from textocvp.model import CheckpointError
+from textocvp.checkpoint import CheckpointError
 
 FIELDS = list(MaskScores.__dataclass_fields__)
 

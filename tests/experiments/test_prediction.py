@@ -16,7 +16,7 @@ from experiments.protocol.workers import Worker
 from experiments.reporting import Results
 from tests.experiments.oracle import LoadOracle
 from tests.experiments.test_films import LoadStill
-from textocvp.jedi import jedi
+from textocvp.metrics.jedi import jedi
 
 MEASURES = Measures(("st_lpips",), None, (), (("lpips", "no weights here"), ("jedi", "none there")))
 

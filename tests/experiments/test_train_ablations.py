@@ -20,8 +20,8 @@ from experiments.protocol.ablation_runs import (
 from experiments.train_ablations import Args, main
 from tests.textocvp.conftest import PLACED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import PRESETS
-from textocvp.model import read_config
+from textocvp.checkpoint import read_config
+from textocvp.presets import PRESETS
 
 TINY = (
     AblationRun("base", "predictor", "reference", "as it is", "tiny-placed"),

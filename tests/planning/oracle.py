@@ -16,7 +16,7 @@ from torch import Tensor
 
 from planning import Instruction, PinholeCamera
 from planning.grounding import COLORS, ROBOT_COLOR, TABLE_COLOR
-from textocvp.renderer import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import Rollout
 from textocvp.slots import SlotLayout
 

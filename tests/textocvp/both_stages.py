@@ -11,9 +11,10 @@ from unittest.mock import patch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import cli, training
-from textocvp.config import PRESETS
-from textocvp.mage.config import MAGE_PRESETS, AxialConfig, MageConfig, VQVAEConfig
+from textocvp import cli
+from textocvp.baselines.mage.config import MAGE_PRESETS, AxialConfig, MageConfig, VQVAEConfig
+from textocvp.presets import PRESETS
+from textocvp.training import run as training
 
 STEPS = 3
 MAGE = MageConfig(

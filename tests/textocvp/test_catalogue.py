@@ -8,11 +8,11 @@ import pytest
 
 from tests.textocvp.conftest import PLACED
 from textocvp import catalogue as module
+from textocvp.baselines.mage.config import MAGE_PRESETS
+from textocvp.baselines.mage.model import Mage
 from textocvp.catalogue import Entry, catalogue
-from textocvp.config import PRESETS
-from textocvp.mage.config import MAGE_PRESETS
-from textocvp.mage.model import Mage
 from textocvp.model import TextOCVP
+from textocvp.presets import PRESETS
 from textocvp.world_model import bundled_checkpoints
 
 

@@ -16,28 +16,30 @@ from torch import Tensor
 
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import cli, train_parser, train_predictor
+from textocvp import cli
+from textocvp.checkpoint import CheckpointError
 from textocvp.config import (
-    PRESETS,
     ModelConfig,
     ParserConfig,
     PredictorConfig,
     RendererConfig,
     TextConfig,
-    preset,
     with_settings,
 )
-from textocvp.dino import DinoEncoder, DinoWeightsError
-from textocvp.episodes import EpisodeFile
-from textocvp.feature_cache import FeatureCacheError
-from textocvp.losses import thing_weights
-from textocvp.model import CheckpointError, TextOCVP
-from textocvp.parser import to_frames
-from textocvp.savi import SaviParser
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.feature_cache import FeatureCacheError
+from textocvp.model import TextOCVP
+from textocvp.parsers.base import to_frames
+from textocvp.parsers.dino import DinoEncoder, DinoWeightsError
+from textocvp.parsers.savi import SaviParser
+from textocvp.presets import PRESETS, preset
 from textocvp.slots import SlotLayout
-from textocvp.train_parser import ParserTraining, parser_loss
-from textocvp.train_predictor import PredictorTraining
-from textocvp.training import SettingsError
+from textocvp.training import parser as train_parser
+from textocvp.training import predictor as train_predictor
+from textocvp.training.losses import thing_weights
+from textocvp.training.parser import ParserTraining, parser_loss
+from textocvp.training.predictor import PredictorTraining
+from textocvp.training.run import SettingsError
 from textocvp.world_model import WorldModel
 
 TINY = ModelConfig(

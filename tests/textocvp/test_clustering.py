@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from textocvp.clustering import ClusterInitializer, FeatureClusters, color_features
+from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters, color_features
 
 RED, BLUE, GRAY, DARK = (255, 87, 89), (78, 121, 167), (186, 176, 172), (47, 47, 47)
 

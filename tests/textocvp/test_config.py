@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from textocvp.config import preset, with_settings
+from textocvp.config import with_settings
+from textocvp.presets import preset
 
 
 def test_settings_reach_the_field_they_name_and_no_other() -> None:

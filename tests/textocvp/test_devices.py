@@ -9,15 +9,15 @@ import torch
 
 from tests.textocvp.both_stages import MAGE
 from tests.textocvp.conftest import PLACED, PUBLISHED
-from textocvp.config import PRESETS, ModelConfig
-from textocvp.losses import thing_weights
-from textocvp.mage.model import Mage
-from textocvp.mage.train_mage import Dynamics as MageDynamics
+from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage.train_mage import MageStage as MageDynamics
+from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
-from textocvp.predictor_loss import moving_weights, slot_loss
-from textocvp.text import WordBatch
-from textocvp.train_parser import Redrawing
-from textocvp.train_predictor import Dynamics
+from textocvp.presets import PRESETS
+from textocvp.text.base import WordBatch
+from textocvp.training.losses import moving_weights, slot_loss, thing_weights
+from textocvp.training.parser import ParserStage
+from textocvp.training.predictor import PredictorStage
 
 TEXTS = ["put the red block in the blue bowl", "put the red block in the light blue bowl"]
 SMALL = ["savi-small", "non-oc-small", "ocvp-seq-small"]
@@ -38,13 +38,13 @@ def test_both_stages_stay_on_the_device(config: ModelConfig) -> None:
     frames = torch.empty(2, 3, 3, side, side, device="meta")
     weights = thing_weights(frames, 4.0)
     generators = [torch.Generator().manual_seed(seed) for seed in range(2)]
-    redrawing = Redrawing(model)
+    redrawing = ParserStage(model)
     loss = redrawing(frames, weights.flatten(0, 1), whole=weights.sum(), share=0.5, generator=generators)
     loss.total(0.1, 0.1, 1.0).backward()
     assert {p.grad.device.type for p in redrawing.parameters() if p.grad is not None} == {"meta"}
 
     slots = torch.empty(2, 4, config.parser.num_slots, layout.dim, device="meta")
-    dynamics = Dynamics(model)
+    dynamics = PredictorStage(model)
     if config.predictor.attention == "causal":
         forgetful = torch.zeros(2, dtype=torch.bool, device="meta")
         predicted = dynamics(slots[:, :3], words, 0, forgetful)

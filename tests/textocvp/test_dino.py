@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 from transformers import BitImageProcessor, Dinov2Model
 
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
-from textocvp.dino import IMAGE_MEAN, IMAGE_STD, DinoEncoder, DinoWeightsError, normalized
-from textocvp.parser import to_frames
+from textocvp.parsers.base import to_frames
+from textocvp.parsers.dino import IMAGE_MEAN, IMAGE_STD, DinoEncoder, DinoWeightsError, normalized
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from textocvp.episodes import Episode, EpisodeFile, EpisodeObject
+from textocvp.data.episodes import Episode, EpisodeFile, EpisodeObject
 
 LENGTHS = (25, 7, 25, 3)
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.config import RendererConfig, preset
-from textocvp.glimpse import BACKGROUND, GlimpseRenderer, draw, read
-from textocvp.slots import SlotLayout, SlotState
+from textocvp.config import RendererConfig
+from textocvp.crop import crop, paste
+from textocvp.presets import preset
+from textocvp.renderers.glimpse import GlimpseRenderer
+from textocvp.slots import PRESENCE_BACKGROUND, SlotLayout, SlotState
 
 LAYOUT = SlotLayout(content=8)
 
@@ -18,7 +20,7 @@ def slots(generator: torch.Generator, batch: int = 2, things: int = 3, unused: i
 
     K = 1 + things + unused
     presence = torch.ones(batch, K, 1)
-    presence[:, 0] = BACKGROUND
+    presence[:, 0] = PRESENCE_BACKGROUND
     presence[:, K - unused :] = 0
     return SlotState(
         content=torch.randn(batch, K, LAYOUT.content, generator=generator),
@@ -41,7 +43,7 @@ def test_what_is_read_is_drawn_back_where_it_was() -> None:
     scale = torch.tensor(
         [[[10 / 64 / 3**0.5, 12 / 64 / 3**0.5]]]
     )  # deviation of a uniform box: side / sqrt(12)
-    back = draw(read(image, center, scale, 24, 2.6), center, scale, 64, 64, 2.6)
+    back = paste(crop(image, center, scale, 24, 2.6), center, scale, 64, 64, 2.6)
     assert (back - image).abs().mean() < 0.01
     assert torch.equal((back > 0.5).float(), image)
 
@@ -50,8 +52,8 @@ def test_moving_the_slot_by_whole_pixels_moves_the_drawing_by_as_much() -> None:
     torch.manual_seed(0)
     picture = torch.rand(1, 1, 1, 16, 16)
     scale = torch.full((1, 1, 2), 0.15)
-    here = draw(picture, torch.tensor([[[-0.2, 0.1]]]), scale, 64, 64, 2.6)
-    there = draw(picture, torch.tensor([[[-0.2 + 5 * 2 / 64, 0.1 - 3 * 2 / 64]]]), scale, 64, 64, 2.6)
+    here = paste(picture, torch.tensor([[[-0.2, 0.1]]]), scale, 64, 64, 2.6)
+    there = paste(picture, torch.tensor([[[-0.2 + 5 * 2 / 64, 0.1 - 3 * 2 / 64]]]), scale, 64, 64, 2.6)
     torch.testing.assert_close(there, here.roll((-3, 5), (-2, -1)), atol=1e-5, rtol=1e-5)
 
 

@@ -11,7 +11,7 @@ import torch
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.test_holistic import NON_OC
 from textocvp.config import ModelConfig
-from textocvp.train_predictor import Dynamics, PredictorTraining, assemble
+from textocvp.training.predictor import PredictorStage, PredictorTraining, assemble
 
 
 def variant(config: ModelConfig, **changes: object) -> ModelConfig:
@@ -37,7 +37,7 @@ def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: P
     frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
     slots_B1KD = model.parser(frames_B1).slots_BTKD
     words = model.text.lookup(["put the red block in the blue bowl", "put the green block in the gray bowl"])
-    predicted_BSKD = Dynamics(model)(slots_B1KD, words, 2)
+    predicted_BSKD = PredictorStage(model)(slots_B1KD, words, 2)
     drawn = model.renderer(predicted_BSKD[:, -1]).frames_B3HW
     (drawn - frames_B1[:, 0].flip(-1)).square().mean().backward()
 

@@ -14,8 +14,9 @@ import torch
 from tests.textocvp.conftest import SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel, cli
-from textocvp.config import PRESETS, ModelConfig, ParserConfig, PredictorConfig, RendererConfig, preset
+from textocvp.config import ModelConfig, ParserConfig, PredictorConfig, RendererConfig
 from textocvp.model import TextOCVP
+from textocvp.presets import PRESETS, preset
 from textocvp.slots import SlotLayout
 
 TEXT = "put the red block in the blue bowl"

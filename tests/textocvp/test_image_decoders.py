@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.image_decoders import NonLocalBlock, build_image_decoder
+from textocvp.renderers.image_decoders import NonLocalBlock, build_image_decoder
 
 
 @pytest.mark.parametrize(("kind", "parameters"), [("cnn", 13_276_419), ("vqgan", 24_645_443)])

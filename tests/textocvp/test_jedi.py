@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from transformers import VJEPA2Config, VJEPA2ForVideoClassification, VJEPA2Model
 
-from textocvp.jedi import jedi, load_vjepa, polynomial_mmd
-from textocvp.perceptual import MetricUnavailable
+from textocvp.metrics.jedi import jedi, load_vjepa, polynomial_mmd
+from textocvp.metrics.perceptual import MetricUnavailable
 
 TINY = VJEPA2Config(
     crop_size=16, patch_size=8, frames_per_clip=4, hidden_size=12, num_attention_heads=1, num_hidden_layers=1,

@@ -13,8 +13,7 @@ from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel
 from textocvp.config import ModelConfig
-from textocvp.longer_window import grow_window, with_longer_window
-from textocvp.train_predictor import PredictorTraining, train
+from textocvp.training.predictor import PredictorTraining, extend_window, train, with_longer_window
 
 TEXT = "put the red block in the blue bowl"
 
@@ -29,7 +28,7 @@ def test_rollouts_within_the_old_window_stay_as_they_are(kind, encoding, scene: 
     model = build(variant(PLACED, kind=kind, color_bias=False, age_encoding=encoding))
     world_model = WorldModel(model)
     before = world_model.rollout(scene, TEXT, horizon=8)
-    grow_window(model, ["predictor.window=20"])
+    extend_window(model, ["predictor.window=20"])
     assert torch.equal(world_model.rollout(scene, TEXT, horizon=8).slots, before.slots)
     assert world_model.longest_horizon == 20
     further = world_model.rollout(scene, TEXT, horizon=20)
@@ -50,11 +49,11 @@ def test_codes_that_training_never_reached_are_not_copied():
 def test_other_changes_and_shorter_windows_are_refused():
     model = build(PLACED)
     with pytest.raises(ValueError, match=r"'predictor.layers=4'.*only predictor.window may grow"):
-        grow_window(model, ["predictor.layers=4"])
+        extend_window(model, ["predictor.layers=4"])
     with pytest.raises(ValueError, match="grow, not shrink: it is 8 frames, 6 were asked for"):
-        grow_window(model, ["predictor.window=6"])
+        extend_window(model, ["predictor.window=6"])
     with pytest.raises(ValueError, match="type int"):
-        grow_window(model, ["predictor.window=long"])
+        extend_window(model, ["predictor.window=long"])
 
 
 def test_fine_tuning_learns_longer_rollouts(tmp_path: Path, scene: np.ndarray):

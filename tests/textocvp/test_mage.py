@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from textocvp.baselines.mage.config import AxialConfig, MageConfig, VQVAEConfig, mage_preset
+from textocvp.baselines.mage.model import Mage
+from textocvp.checkpoint import CheckpointError
 from textocvp.config import TextConfig
-from textocvp.mage.config import AxialConfig, MageConfig, VQVAEConfig, mage_preset
-from textocvp.mage.model import Mage
-from textocvp.model import CheckpointError
-from textocvp.video import load_video_model
+from textocvp.protocols import load_model
 from textocvp.world_model import WorldModel
 
 TINY = MageConfig(
@@ -117,7 +117,7 @@ def test_a_checkpoint_comes_back_and_a_damaged_one_is_refused(model: Mage, tmp_p
 
 
 def test_the_bundled_one_is_its_preset_and_imagines_through_the_common_door() -> None:
-    model = load_video_model("mage-small")
+    model = load_model("mage-small")
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     frames = model.imagine(picture, TEXTS[0], horizon=2)
     assert frames.shape == (1, 3, 3, 64, 64) and frames.min() >= 0 and frames.max() <= 1

@@ -9,18 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from textocvp.metrics import (
-    bootstrap_interval,
-    followed,
-    foreground_ari,
-    object_ious,
-    psnr,
-    ratio_interval,
-    relative_change,
-    slot_labels,
-    ssim,
-    wilson_interval,
-)
+from textocvp.metrics.frames import psnr, ssim
+from textocvp.metrics.intervals import bootstrap_interval, ratio_interval, relative_change, wilson_interval
+from textocvp.metrics.masks import followed, foreground_ari, object_ious, slot_labels
 
 
 def ari_by_counting_pairs(labels: np.ndarray, truth: np.ndarray) -> float:

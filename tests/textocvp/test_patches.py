@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
-from textocvp.config import ModelConfig, RendererConfig, preset, with_settings
-from textocvp.losses import read_place_loss, thing_weights
+from textocvp.config import ModelConfig, RendererConfig, with_settings
+from textocvp.layers import pixel_grid
 from textocvp.model import TextOCVP
-from textocvp.patches import MIN_SCALE, PatchDecoder, PatchRenderer, gaussian_prior, position_code
-from textocvp.placed import moments
-from textocvp.slots import SlotLayout, pixel_grid
-from textocvp.train_parser import parser_loss
+from textocvp.presets import preset
+from textocvp.renderers.patches import MIN_SCALE, PatchDecoder, PatchRenderer, gaussian_prior, position_code
+from textocvp.slots import SlotLayout, moments
+from textocvp.training.losses import read_place_loss, thing_weights
+from textocvp.training.parser import parser_loss
 
 LAYOUT = SlotLayout(content=6, explicit=False)
 

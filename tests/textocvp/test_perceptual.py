@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from textocvp.perceptual import MetricUnavailable, load_lpips
+from textocvp.metrics.perceptual import MetricUnavailable, load_lpips
 
 
 class MeanDifference(nn.Module):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from textocvp.config import ParserConfig
-from textocvp.parser import build_parser
-from textocvp.placed import PlacedParser, moments
-from textocvp.slots import SlotLayout, SlotState
+from textocvp.parsers import build_parser
+from textocvp.parsers.placed import PlacedParser
+from textocvp.slots import SlotLayout, SlotState, moments
 
 CONFIG = ParserConfig(num_slots=6, layout=SlotLayout(content=16), hidden=32)
 RED, BLUE, DARK = (255, 87, 89), (78, 121, 167), (47, 47, 47)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from textocvp.config import PredictorConfig, TextConfig
-from textocvp.predictor import Predictor, build_predictor
-from textocvp.predictor_base import SlotPredictor
-from textocvp.predictor_layer import color_match
+from textocvp.predictors import build_predictor
+from textocvp.predictors.base import SlotPredictor
+from textocvp.predictors.textocvp import Predictor, color_match
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from textocvp.drawing import slot_palette
-from textocvp.renderer import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import CHUNK, Rollout
 from textocvp.slots import SlotLayout, SlotState
 

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
-from textocvp.config import ParserConfig, RendererConfig, preset
-from textocvp.initializers import GaussianInitializer
+from textocvp.config import ParserConfig, RendererConfig
 from textocvp.model import TextOCVP
-from textocvp.parser import build_parser
-from textocvp.renderer import build_renderer
-from textocvp.savi import SaviParser, SlotAttention
+from textocvp.parsers import build_parser
+from textocvp.parsers.savi import GaussianInitializer, SaviParser, SlotAttention
+from textocvp.presets import preset
+from textocvp.renderers import build_renderer
 from textocvp.slots import SlotLayout
 
 CONFIG = PUBLISHED.parser

@@ -12,8 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from textocvp.perceptual import load_st_lpips
-from textocvp.shift_tolerant import WeightsNotFound, load_shift_tolerant, weights_file
+from textocvp.metrics.perceptual import WeightsNotFound, load_shift_tolerant, load_st_lpips, weights_file
 
 
 @pytest.fixture
@@ -87,8 +86,8 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
 
 
 def test_without_the_package_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    from textocvp import shift_tolerant
-    from textocvp.perceptual import MetricUnavailable
+    from textocvp.metrics import perceptual as shift_tolerant
+    from textocvp.metrics.perceptual import MetricUnavailable
 
     monkeypatch.setattr(shift_tolerant, "find_spec", lambda name: None)
     with pytest.raises(MetricUnavailable, match="pip install stlpips_pytorch"):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-import textocvp.slot_cache as module
+import textocvp.data.slot_cache as module
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.episodes import EpisodeFile
-from textocvp.slot_cache import SlotCache, SlotCacheError, cached_slots, parse_share, parser_fingerprint
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.slot_cache import SlotCache, SlotCacheError, cached_slots, parse_share, parser_fingerprint
 
 
 @pytest.fixture

@@ -14,13 +14,13 @@ from transformers import T5Config, T5EncoderModel, T5ForConditionalGeneration
 
 from tests.textocvp.conftest import PLACED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import text_weights
+from textocvp.checkpoint import CheckpointError
 from textocvp.config import ModelConfig, TextConfig
-from textocvp.model import CheckpointError, TextOCVP
+from textocvp.model import TextOCVP
 from textocvp.text import build_text_encoder
-from textocvp.text_pretrained import PretrainedEncoder
-from textocvp.text_weights import TextWeightsError
-from textocvp.train_predictor import PredictorTraining, train
+from textocvp.text import pretrained as text_weights
+from textocvp.text.pretrained import PretrainedEncoder, TextWeightsError
+from textocvp.training.predictor import PredictorTraining, train
 
 VOCABULARY = [
     "<pad>",

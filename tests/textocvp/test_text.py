@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from textocvp.config import TextConfig
-from textocvp.lexicon import TABLEAU_10, color_of, palette
-from textocvp.text import TextEncoder, build_text_encoder
-from textocvp.text_words import COLOR
+from textocvp.text import build_text_encoder
+from textocvp.text.base import TextEncoder
+from textocvp.text.words import COLOR, TABLEAU_10, color_of, palette
 
 CAPTION = "put the red block in the gray bowl"
 

@@ -13,18 +13,18 @@ from safetensors.torch import load_file
 from tests.textocvp.both_stages import MAGE
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import training
-from textocvp.episodes import EpisodeFile
-from textocvp.mage import train_mage, train_vqvae
-from textocvp.mage.checkpoint import load_vqvae
-from textocvp.mage.codes import CodeCache, CodeCacheError, cached_codes
-from textocvp.mage.config import MAGE_PRESETS
-from textocvp.mage.model import Mage
-from textocvp.mage.train_mage import MageTraining
-from textocvp.mage.train_vqvae import VQVAETraining
-from textocvp.mage.vqvae import VQVAE, Codebook, perplexity
-from textocvp.model import CheckpointError
-from textocvp.training import SettingsError
+from textocvp.baselines.mage import train_mage, train_vqvae
+from textocvp.baselines.mage.checkpoint import load_vqvae
+from textocvp.baselines.mage.codes import CodeCache, CodeCacheError, cached_codes
+from textocvp.baselines.mage.config import MAGE_PRESETS
+from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage.train_mage import MageTraining
+from textocvp.baselines.mage.train_vqvae import VQVAETraining
+from textocvp.baselines.mage.vqvae import VQVAE, Codebook, perplexity
+from textocvp.checkpoint import CheckpointError
+from textocvp.data.episodes import EpisodeFile
+from textocvp.training import run as training
+from textocvp.training.run import SettingsError
 
 
 @pytest.fixture

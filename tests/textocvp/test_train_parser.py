@@ -11,15 +11,15 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import training
-from textocvp.config import PRESETS
-from textocvp.episodes import EpisodeFile
-from textocvp.losses import image_loss, mask_loss, thing_weights
-from textocvp.metrics import Interval
+from textocvp.data.episodes import EpisodeFile
+from textocvp.metrics.intervals import Interval
 from textocvp.model import TextOCVP
-from textocvp.parser_quality import ParserQuality, measure_parser
-from textocvp.renderer import Rendered
-from textocvp.train_parser import ParserTraining, parser_loss, to_frames, train
+from textocvp.presets import PRESETS
+from textocvp.renderers.base import Rendered
+from textocvp.training import run as training
+from textocvp.training.evaluate_parser import ParserMetrics, measure_parser
+from textocvp.training.losses import image_loss, mask_loss, thing_weights
+from textocvp.training.parser import ParserTraining, parser_loss, to_frames, train
 
 
 @pytest.fixture
@@ -120,9 +120,9 @@ def test_quality_is_perfect_for_masks_that_are_the_segmentation(run):
 
 
 def test_gates_name_what_is_not_good_enough():
-    def quality(miou: float, found: float) -> ParserQuality:
+    def quality(miou: float, found: float) -> ParserMetrics:
         figures = [Interval(value, value, value, 1) for value in (miou, found, 0.95, 0.5, 20.0)]
-        return ParserQuality(*figures)
+        return ParserMetrics(*figures)
 
     assert quality(0.80, 0.93).missed_gates() == []
     assert quality(0.79, 0.93).missed_gates() == ["object_miou is 0.790, below its gate of 0.80"]

@@ -11,18 +11,24 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp import training
 from textocvp.config import ModelConfig, PredictorConfig, TextConfig
-from textocvp.episodes import EpisodeFile
-from textocvp.following import FollowingTest, Thing, ask, things_of
-from textocvp.lessons import Lesson, next_lesson
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.slot_batches import SlotBatches
+from textocvp.data.slot_cache import SlotCache
 from textocvp.model import TextOCVP
-from textocvp.predictor_data import SlotBatches
-from textocvp.predictor_loss import moving_weights, slot_loss
-from textocvp.slot_cache import SlotCache
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
-from textocvp.train_predictor import Dynamics, PredictorTraining, train, true_frames
+from textocvp.training import run as training
+from textocvp.training.evaluate_predictor import FollowingTest, Thing, ask, things_of
+from textocvp.training.losses import moving_weights, slot_loss
+from textocvp.training.predictor import (
+    Lesson,
+    PredictorStage,
+    PredictorTraining,
+    next_lesson,
+    train,
+    true_frames,
+)
 from textocvp.world_model import WorldModel
 
 LAYOUT = SlotLayout(content=4)
@@ -187,7 +193,7 @@ def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained():
 def test_imagined_frames_are_the_rollout_and_each_predicts_the_next():
     model, slots = build(PLACED), batches().draw(np.random.default_rng(0), 3)
     model = build(replace(PLACED, parser=replace(PLACED.parser, layout=LAYOUT)))
-    dynamics = Dynamics(model)
+    dynamics = PredictorStage(model)
     predicted = dynamics(slots.slots_BTKD[:, :2], slots.words, 3)
     with torch.no_grad():
         text = model.text.encode(slots.words)
@@ -317,7 +323,7 @@ class _Obedient(torch.nn.Module):
         for b, sentence in enumerate(text):
             block, bowl = self.places[sentence]
             slots[b, -1, block] = slots[b, 0, bowl]
-        from textocvp.predictor import Imagined
+        from textocvp.predictors import Imagined
 
         return Imagined(slots)
 

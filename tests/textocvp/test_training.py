@@ -18,13 +18,16 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tests.textocvp import both_stages
 from tests.textocvp.conftest import PLACED, PUBLISHED
-from textocvp import cli, train_parser, train_predictor, training
-from textocvp.config import PRESETS
-from textocvp.episodes import EpisodeFile
-from textocvp.loading import read_ahead
-from textocvp.train_parser import ClipReader, ParserTraining
-from textocvp.train_predictor import PredictorTraining
-from textocvp.training import Run, SettingsError
+from textocvp import cli
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.prefetch import prefetch
+from textocvp.presets import PRESETS
+from textocvp.training import parser as train_parser
+from textocvp.training import predictor as train_predictor
+from textocvp.training import run as training
+from textocvp.training.parser import ClipReader, ParserTraining
+from textocvp.training.predictor import PredictorTraining
+from textocvp.training.run import Run, SettingsError
 
 
 @pytest.fixture
@@ -112,7 +115,7 @@ def test_workers_read_the_steps_in_their_order(folder: Path) -> None:
         reader = ClipReader(episodes, args, slice(0, args.batch))
         expected = [reader(step) for step in range(4, 11)]
         for workers in (1, 3):
-            read = list(read_ahead(reader, range(4, 11), workers))
+            read = list(prefetch(reader, range(4, 11), workers))
             assert len(read) == len(expected)
             for a, b in zip(read, expected, strict=True):
                 assert torch.equal(a.frames_BTHW3, b.frames_BTHW3) and torch.equal(a.seeds_B, b.seeds_B)
@@ -123,7 +126,7 @@ def test_workers_outlive_the_signal_that_ends_a_run(folder: Path) -> None:
     """A cluster sends it to whole process groups, and without workers the last update could not be finished."""
     args = parser_run(folder, "out")
     with EpisodeFile(args.data) as episodes:
-        batches = iter(read_ahead(ClipReader(episodes, args, slice(None)), range(40), 1))
+        batches = iter(prefetch(ClipReader(episodes, args, slice(None)), range(40), 1))
         next(batches)
         (worker,) = multiprocessing.active_children()
         os.kill(worker.pid, signal.SIGTERM)

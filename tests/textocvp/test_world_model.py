@@ -11,7 +11,7 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from textocvp import Rollout, WorldModel
-from textocvp.model import CheckpointError
+from textocvp.checkpoint import CheckpointError
 from textocvp.world_model import bundled_checkpoints
 
 TEXT = "put the red block in the blue bowl"

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from textocvp.episodes import FORMAT, FORMAT_VERSION
+from textocvp.data.episodes import FORMAT, FORMAT_VERSION
 
 COLORS = {"red": (255, 87, 89), "blue": (78, 121, 167), "green": (89, 169, 79), "yellow": (237, 201, 72)}
 ARM = (90, 60, 210)

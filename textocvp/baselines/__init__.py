@@ -1,0 +1,1 @@
+"""Models that TextOCVP is compared with and that are no TextOCVP themselves."""

@@ -1,0 +1,1 @@
+"""Episode files, what is cached of them, and training batches."""

@@ -1,0 +1,156 @@
+"""Batches of whole episodes in slot space, and the recolouring that teaches what colour words mean.
+
+Recolouring: the three colour channels of a scene's slots and of its sentence's lexicon colours are put into
+one random order. A parser whose content ignores hue (see `textocvp.parsers.placed`) would have found just these slots
+in the recoloured video, so a few caption colours become many, and the rule "the slot whose colour is the
+word's" is what they share. Where words carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red"
+would stay "red" while the red block turns blue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from textocvp.data.episodes import EpisodeFile
+from textocvp.data.slot_cache import SlotCache
+from textocvp.parsers.base import to_frames
+from textocvp.slots import SlotLayout, SlotState
+from textocvp.text.base import TextEncoder, WordBatch
+
+
+@dataclass
+class SlotBatch:
+    """Episodes of one length.
+
+    Attributes:
+        slots_BTKD: true slots, float32; unused slots that no episode of the batch needs are left out.
+        words: the sentences, looked up.
+        episodes_B: numbers of the episodes.
+        channels_B3: the order of the colour channels that was drawn, for whoever recolours frames alike.
+    """
+
+    slots_BTKD: Tensor
+    words: WordBatch
+    episodes_B: np.ndarray
+    channels_B3: Tensor
+
+    def to(self, device: torch.device | str) -> SlotBatch:
+        return replace(self, slots_BTKD=self.slots_BTKD.to(device), words=self.words.to(device))
+
+    def select(self, rows: slice) -> SlotBatch:
+        """A sub-batch."""
+        return SlotBatch(
+            self.slots_BTKD[rows], self.words.select(rows), self.episodes_B[rows], self.channels_B3[rows]
+        )
+
+
+class SlotBatches:
+    """Draws training batches from a slot cache held in memory.
+
+    Args:
+        cache: the slots of the training episodes.
+        layout: what their numbers mean.
+        text: looks the sentences up; its weights are not used.
+        frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
+        recolor: permute the colour channels. Has no effect, like `color_spread`, where slots have no explicit colour
+            or the words of `text` no RGB.
+        color_spread: stretch each colour channel of a scene and of its sentence by up to this, and shift it by up to
+            this, so that colours brighter and darker than the captioned ones are met.
+        color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
+        place_jitter: standard deviation of the noise of `noisy`, in -1..1.
+    """
+
+    def __init__(
+        self,
+        cache: SlotCache,
+        layout: SlotLayout,
+        text: TextEncoder,
+        frames: int,
+        *,
+        recolor: bool,
+        color_spread: float,
+        color_jitter: float,
+        place_jitter: float,
+    ) -> None:
+        words_follow = layout.explicit and text.words_have_rgb
+        self.layout, self.recolor = layout, recolor and words_follow
+        self.color_spread = color_spread if words_follow else 0.0
+        self.color_jitter, self.place_jitter = color_jitter, place_jitter
+        self.frames = frames
+        self._slots_ETKD = cache.padded(frames)
+        self._words = text.lookup(cache.instructions).to("cpu")
+
+    def __len__(self) -> int:
+        return len(self._slots_ETKD)
+
+    def content_statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (C,) of the content of used slots, over at most 1000 episodes."""
+        chosen = self._slots_ETKD[:: max(1, len(self) // 1000)].float().flatten(0, 2)
+        if self.layout.explicit:
+            chosen = chosen[chosen[:, -1] >= 0.5][:, : self.layout.content]
+        # A channel that never changes carries nothing: no tiny deviation may blow its noise up.
+        std = chosen.std(dim=0)
+        return chosen.mean(dim=0), std.clamp(min=max(1e-3, 0.05 * float(std.median())))
+
+    def draw(self, rng: np.random.Generator, size: int) -> SlotBatch:
+        """Episodes picked at random, recoloured."""
+        episodes_B = rng.integers(len(self), size=size)
+        index = torch.from_numpy(episodes_B)
+        slots_BTKD, words = self._slots_ETKD[index].float(), self._words.select(index)
+        channels_B3 = torch.arange(3).expand(size, 3)
+        if not self.layout.explicit:
+            return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
+        slots_BTKD = _used(slots_BTKD)
+        state = SlotState.split(slots_BTKD, self.layout)
+        if self.recolor:
+            channels_B3 = torch.from_numpy(rng.permuted(np.tile(np.arange(3), (size, 1)), axis=1))
+            words = words.permute_channels(channels_B3)
+        # Colour and presence are carried through a rollout: what they are in the first frame they are in all.
+        order = channels_B3[:, None, None].expand_as(state.color[:, :1])
+        color = state.color[:, :1].gather(-1, order)
+        stretch_B3, shift_B3 = (
+            torch.from_numpy(rng.uniform(-self.color_spread, self.color_spread, (size, 3)).astype(np.float32))
+            for _ in range(2)
+        )
+        color = color + stretch_B3[:, None, None] * color + shift_B3[:, None, None]
+        color = (color + _noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
+        presence = state.presence[:, :1].expand_as(state.presence)
+        slots_BTKD = replace(state, color=color, presence=presence).join()
+        colors_BL3 = words.colors_BL3 + stretch_B3[:, None] * words.colors_BL3 + shift_B3[:, None]
+        colors_BL3 = colors_BL3 + _noise(rng, colors_BL3.shape, self.color_jitter)
+        words = replace(words, colors_BL3=colors_BL3 * words.names_color_BL[..., None])
+        return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
+
+    def noisy(self, rng: np.random.Generator, slots_BTKD: Tensor) -> Tensor:
+        """The same slots, each a little off its place: a teacher-forced predictor that has only seen exact
+        places does not know how to come back from its own small errors."""
+        if not self.layout.explicit or self.place_jitter == 0:
+            return slots_BTKD
+        state = SlotState.split(slots_BTKD, self.layout)
+        noise = _noise(rng, state.position.shape, self.place_jitter).to(slots_BTKD.device)
+        return replace(state, position=state.position + noise * state.is_thing).join()
+
+
+def _used(slots_BTKD: Tensor) -> Tensor:
+    """The slots with presence first in every episode, cut to the most that any episode of the batch has."""
+    used_BK = slots_BTKD[..., -1].amax(dim=1) >= 0.5
+    order_BK = used_BK.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    order_BK = order_BK[:, : int(used_BK.sum(dim=1).max())]
+    return slots_BTKD.gather(
+        2, order_BK[:, None, :, None].expand(-1, slots_BTKD.shape[1], -1, slots_BTKD.shape[3])
+    )
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Tensor:
+    return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)) * deviation
+
+
+def true_frames(episodes: EpisodeFile, batch: SlotBatch, times_BS: np.ndarray) -> Tensor:
+    """The frames (B, S, 3, H, W), -1..1, of these times, recoloured as the batch's slots were."""
+    clips = episodes.frames(batch.episodes_B)
+    chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]
+    frames_BS3HW = to_frames(np.stack(chosen))
+    return frames_BS3HW.gather(2, batch.channels_B3[:, None, :, None, None].expand_as(frames_BS3HW))

@@ -1,0 +1,1 @@
+"""How alike masks and frames are, and how sure one can be of it."""

@@ -1,0 +1,170 @@
+"""JEDi: how far a set of imagined films is from a set of real ones (Luo et al., "Beyond FVD", ICLR 2025).
+
+Maximum mean discrepancy with a polynomial kernel between V-JEPA features of the two sets. Lower is more alike, 0 for
+equal sets. The original takes the attentive probe of V-JEPA (ViT-L, Something-Something v2); here it is that of V-JEPA
+2, which transformers has, so figures compare with each other and not with those of the paper. Where its weights are not
+on the machine the figure is absent with a reason; it is never computed with random ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from textocvp.metrics.intervals import Interval
+from textocvp.metrics.perceptual import MetricUnavailable
+
+VJEPA = "facebook/vjepa2-vitl-fpc16-256-ssv2"
+#: Mean and deviation of ImageNet's colours for pictures in 0..1: what V-JEPA was trained on.
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class VideoFeatures(Protocol):
+    """Says in D numbers what happens in a film.
+
+    Attributes:
+        name: for tables.
+    """
+
+    name: str
+
+    def __call__(self, films_NT3HW: Tensor) -> Tensor:
+        """Features (N, D) of films (N, T, 3, H, W) in 0..1."""
+
+
+def polynomial_mmd(imagined_ND: np.ndarray, real_MD: np.ndarray) -> float:
+    """100 times the squared maximum mean discrepancy, biased (a set's own pairs count), kernel (x . y / D) ** 2.
+
+    Args:
+        imagined_ND, real_MD: features of the two sets.
+
+    Raises:
+        ValueError: unless both are (any number, D) and not empty.
+    """
+    kernels = _kernels(imagined_ND, real_MD)
+    ones = [np.full((1, len(kernel)), 1 / len(kernel)) for kernel in kernels[:2]]
+    return float(_discrepancy(kernels, *ones)[0])
+
+
+def jedi(
+    imagined_ND: np.ndarray,
+    real_ND: np.ndarray,
+    *,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """JEDi of N imagined films and the N real ones, with a bootstrap interval over scenes.
+
+    A scene is drawn with both its films. A scene that is drawn twice is paired with itself, which adds to the biased
+    figure of every resample; the interval is therefore moved so that the resamples' mean lies on the figure.
+
+    Args:
+        imagined_ND, real_ND: features, row i of both from scene i.
+        confidence, resamples, seed: of the interval.
+
+    Raises:
+        ValueError: if the shapes differ or there is no film.
+    """
+    if imagined_ND.shape != real_ND.shape:
+        raise ValueError(
+            f"need a real film for each imagined one, got {imagined_ND.shape} and {real_ND.shape}"
+        )
+    kernels, N = _kernels(imagined_ND, real_ND), len(real_ND)
+    value = polynomial_mmd(imagined_ND, real_ND)
+    shares_SN = np.random.default_rng(seed).multinomial(N, np.full(N, 1 / N), size=resamples) / N
+    found_S = _discrepancy(kernels, shares_SN, shares_SN)
+    low, high = np.quantile(found_S, [0.5 - confidence / 2, 0.5 + confidence / 2]) - found_S.mean() + value
+    return Interval(value, max(0.0, min(float(low), value)), max(float(high), value), N)
+
+
+def _kernels(x_ND: np.ndarray, y_MD: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    x, y = (np.asarray(a, dtype=np.float64) for a in (x_ND, y_MD))
+    if x.ndim != 2 or y.ndim != 2 or x.shape[1] != y.shape[1] or 0 in (*x.shape, *y.shape):
+        raise ValueError(f"need features (N, D) and (M, D), got {x.shape} and {y.shape}")
+    D = x.shape[1]
+    return (x @ x.T / D) ** 2, (y @ y.T / D) ** 2, (x @ y.T / D) ** 2
+
+
+def _discrepancy(kernels: tuple[np.ndarray, ...], a_SN: np.ndarray, b_SM: np.ndarray) -> np.ndarray:
+    """(S,) for S pairs of weightings of the two sets."""
+    own, other, between = kernels
+    parts = [np.einsum("sn,nm,sm->s", a, k, b, optimize=True)
+             for a, k, b in ((a_SN, own, a_SN), (b_SM, other, b_SM), (a_SN, between, b_SM))]  # fmt: skip
+    # Never below 0 but by rounding.
+    return 100 * np.maximum(parts[0] + parts[1] - 2 * parts[2], 0.0)
+
+
+@dataclass(frozen=True)
+class VJepaFeatures:
+    """The attentive probe of V-JEPA 2, or the mean of its tokens where a checkpoint has no probe.
+
+    Attributes:
+        name: for tables.
+        model: `VJEPA2ForVideoClassification` or `VJEPA2Model`.
+    """
+
+    name: str
+    model: Any
+
+    @torch.no_grad()
+    def __call__(self, films_NT3HW: Tensor) -> Tensor:
+        """See `VideoFeatures`. Films are stretched to the model's length and size."""
+        config = self.model.config
+        T = films_NT3HW.shape[1]
+        moments = torch.linspace(0, T - 1, config.frames_per_clip).round().long()
+        frames = films_NT3HW[:, moments].float().to(self.model.device)
+        size = (config.crop_size, config.crop_size)
+        flat = F.interpolate(frames.flatten(0, 1), size=size, mode="bicubic", antialias=True).clamp(0, 1)
+        mean, deviation = (flat.new_tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
+        pixels = ((flat - mean) / deviation).unflatten(0, frames.shape[:2])
+        probe = getattr(self.model, "pooler", None)
+        encoder = self.model if probe is None else self.model.vjepa2
+        # One at a time: a film is thousands of tokens.
+        found = []
+        for film in pixels:
+            tokens_1ND = encoder(pixel_values_videos=film[None], skip_predictor=True).last_hidden_state
+            found.append(tokens_1ND.mean(dim=1) if probe is None else probe(tokens_1ND))
+        return torch.cat(found).cpu()
+
+
+def load_vjepa(name_or_folder: str | Path = VJEPA) -> VJepaFeatures:
+    """V-JEPA 2 from a folder, or from the Hugging Face cache of this machine by its hub id. Nothing is fetched.
+
+    Raises:
+        MetricUnavailable: if its weights are not there or not complete.
+    """
+    try:
+        from transformers import AutoConfig, VJEPA2ForVideoClassification, VJEPA2Model
+        from transformers.utils import logging
+    except ImportError as error:
+        raise MetricUnavailable(
+            f"JEDi needs transformers of at least 4.53, which has V-JEPA 2: {error}"
+        ) from error
+
+    name = str(name_or_folder)
+    before = logging.get_verbosity()
+    logging.set_verbosity_error()  # it would print the list of missing weights, which is said below
+    try:
+        config = AutoConfig.from_pretrained(name, local_files_only=True)
+        probed = VJEPA2ForVideoClassification.__name__ in (config.architectures or [])
+        kind: Any = VJEPA2ForVideoClassification if probed else VJEPA2Model
+        model, report = kind.from_pretrained(name, local_files_only=True, output_loading_info=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = str(error).split("\n")[0]
+        raise MetricUnavailable(
+            f"JEDi needs weights of V-JEPA 2 on this machine: `hf download {VJEPA}` fetches them (1.5 GB), "
+            f"or give a folder: {reason}"
+        ) from error
+    finally:
+        logging.set_verbosity(before)
+    # transformers fills what is missing with random numbers.
+    if wrong := [*report["missing_keys"], *report["mismatched_keys"]]:
+        raise MetricUnavailable(f"{name} is not complete: {len(wrong)} weights are missing, as {wrong[0]}")
+    return VJepaFeatures(f"V-JEPA 2, {Path(name).name}", model.float().eval().requires_grad_(False))

@@ -1,0 +1,76 @@
+"""From frames to slots: the interface that every scene parser has, and the one place that picks one.
+
+A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition
+(between frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the
+subclass's business.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from textocvp.slots import SlotLayout
+
+
+@dataclass
+class Parsed:
+    """What a parser found.
+
+    Attributes:
+        slots_BTKD: the corrected slots of every frame.
+        attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
+        expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None
+            for a parser whose slots have no place that could be expected.
+        features_BTLF: what a frozen encoder saw, of L patches row by row: what reconstructed features are compared
+            with; None for a parser that learns its encoder.
+    """
+
+    slots_BTKD: Tensor
+    attention_BTKHW: Tensor
+    expected_BTKD: Tensor | None = None
+    features_BTLF: Tensor | None = None
+
+
+class SceneParser(nn.Module):
+    """Frames to slots. Subclasses set `layout` and write `forward`.
+
+    Attributes:
+        layout: what the numbers of one slot mean.
+    """
+
+    layout: SlotLayout
+
+    @property
+    def encoder_fingerprint(self) -> str:
+        """Of the weights of a frozen encoder that is no part of the checkpoint; empty where there is none."""
+        return ""
+
+    @abstractmethod
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Parsed:
+        """Parse clips.
+
+        Args:
+            frames_BT3HW: frames in -1..1, of the size the parser was built for.
+            num_slots: how many slots to use, background included; the configured number by default.
+            generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by
+                default. One for each clip, on any device: what is drawn for a clip then does not depend on
+                which others are parsed with it.
+        """
+        raise NotImplementedError
+
+
+def to_frames(clips: np.ndarray | Tensor, device: torch.device | str = "cpu") -> Tensor:
+    """Clips (B, T, H, W, 3) uint8 as the model's frames (B, T, 3, H, W), float in -1..1."""
+    return torch.as_tensor(clips).to(device).permute(0, 1, 4, 2, 3).float() / 127.5 - 1

@@ -1,0 +1,78 @@
+"""The parser of Non-OC, the baseline without objects: a frame is one slot (TextOCVP, TMLR 2026, section 4).
+
+A block of convolutions and an average pooling make one vector of each frame, alone. Everything after it, the predictor
+above all, is the same as for many slots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from textocvp.config import ParserConfig
+from textocvp.layers import PositionCode, init_relu_
+from textocvp.parsers.base import Parsed, SceneParser
+
+
+class HolisticParser(SceneParser):
+    """Frames to one slot each: four convolutions that halve the frame three times, average pooling, a linear layer.
+
+    Features are told where they are before they are pooled, so that the average can say what is where. With more than
+    one cell (`pool_cells`) the slot is a linear function of the cells' averages.
+
+    Raises:
+        ValueError: if the layout has explicit channels (one slot has no one place), there is more than one slot, or
+            the frame is too small to be divided into the cells.
+    """
+
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        if config.layout.explicit:
+            raise ValueError("parser.corrector 'holistic' needs parser.layout.explicit = false")
+        if config.num_slots != 1:
+            raise ValueError(
+                f"parser.corrector 'holistic' has 1 slot, not parser.num_slots = {config.num_slots}"
+            )
+        if not 1 <= config.pool_cells <= config.image_size // 8:
+            raise ValueError(
+                f"parser.pool_cells must be 1 to {config.image_size // 8}, the features of a frame of "
+                f"{config.image_size} pixels, not {config.pool_cells}"
+            )
+        self.config, self.layout = config, config.layout
+        channels, wide = config.encoder_channels, 2 * config.encoder_channels
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, channels, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, wide, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(wide, wide, 3, stride=2, padding=1),
+        )
+        self.position = PositionCode(wide)
+        self.mix = nn.Sequential(nn.ReLU(), nn.Conv2d(wide, 2 * wide, 3, padding=1), nn.ReLU())
+        self.slot = nn.Linear(2 * wide * config.pool_cells**2, config.layout.dim)
+        init_relu_(self)
+
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Parsed:
+        """See `SceneParser`. Nothing is drawn at random, so `generator` is not used.
+
+        Raises:
+            ValueError: if more than one slot is asked for.
+        """
+        if num_slots not in (None, 1):
+            raise ValueError(
+                f"this model sees a frame as one slot (parser.corrector 'holistic'); it cannot use {num_slots}"
+            )
+        B, T = frames_BT3HW.shape[:2]
+        features_NChw = self.mix(self.position(self.convolutions(frames_BT3HW.flatten(0, 1))))
+        pooled_NCpp = F.adaptive_avg_pool2d(features_NChw, self.config.pool_cells)
+        slots_BT1D = self.slot(pooled_NCpp.flatten(1)).unflatten(0, (B, T))[:, :, None]
+        return Parsed(slots_BT1D, features_NChw.new_ones(B, T, 1, *features_NChw.shape[-2:]))

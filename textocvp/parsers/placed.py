@@ -1,0 +1,216 @@
+"""The parser that ships: slots that know their colour, place and size.
+
+Every frame is shared out among the slots by colour and place, a competition (softmax over slots) like that of slot
+attention, with keys and queries that are explicit instead of learned: the colour features of a pixel and of a slot,
+and how far the pixel lies from the slot in units of the slot's size (Invariant Slot Attention, Biza et al. 2023).
+What is learned is the content: a slot's pixels, read in the slot's own coordinates, update it through a GRU and a
+residual MLP (Locatello et al. 2020), and a transformer block carries the slots to the next frame (SAVi, Kipf et al.
+2022). The learned part never sees hue, only masks and luminance, so the content is exactly the same when the colour
+channels of the video are permuted: that is what lets training recolour whole scenes in slot space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from textocvp.config import ParserConfig
+from textocvp.crop import crop
+from textocvp.layers import pixel_grid
+from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.parsers.clustering import ClusterInitializer, color_features, squared_distances
+from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
+
+
+class PlaceAttention(nn.Module):
+    """Which slot each pixel belongs to, by colour and place.
+
+    Args:
+        sharpness: weight of a squared colour-feature distance in the logits.
+        stranger: squared colour-feature distance beyond which a pixel belongs to no thing (it goes to the background).
+        place: weight of the place term, `log(1 + d^2)`, heavy-tailed so that a thing that moved is still found.
+        reach: how far a thing may move between frames without cost, added to three times its scale.
+    """
+
+    def __init__(
+        self, sharpness: float = 240.0, stranger: float = 0.12, place: float = 12.0, reach: float = 0.08
+    ) -> None:
+        super().__init__()
+        self.sharpness = sharpness
+        self.stranger = stranger
+        self.place = place
+        self.reach = reach
+
+    @torch.no_grad()
+    def forward(self, frames: Tensor, state: SlotState) -> Tensor:
+        """Attention (B, K, H, W), summing to 1 over the slots, of frames (B, 3, H, W) for slots (B, K)."""
+        B, _, H, W = frames.shape
+        colors_BNC = color_features(frames.flatten(2).transpose(1, 2).float())
+        distance_BKN = squared_distances(color_features(state.color.float()), colors_BNC)
+        logits_BKN = -self.sharpness * distance_BKN
+
+        # Squared offset in units of the slot's size, added up from its two axes: far cheaper than a grid of vectors.
+        reach_BK2 = 3 * state.scale + self.reach
+        grid_HW2 = pixel_grid(H, W, device=frames.device)
+        dx_BKW = (grid_HW2[0, :, 0] - state.position[..., :1]) / reach_BK2[..., :1]
+        dy_BKH = (grid_HW2[:, 0, 1] - state.position[..., 1:]) / reach_BK2[..., 1:]
+        offset_BKHW = dx_BKW.square()[:, :, None, :] + dy_BKH.square()[..., None]
+        place_BKN = -self.place * torch.log1p(offset_BKHW).flatten(2)
+
+        is_background = state.presence > 1.5
+        things_BKN = (logits_BKN + place_BKN).masked_fill(state.presence < 0.5, float("-inf"))
+        canvas_BKN = torch.logaddexp(logits_BKN, torch.full_like(logits_BKN, -self.sharpness * self.stranger))
+        return torch.where(is_background, canvas_BKN, things_BKN).softmax(dim=1).view(B, -1, H, W)
+
+
+class PlacedCorrector(nn.Module):
+    """Updates the slots from one frame: attention, explicit state from its moments, content through a GRU.
+
+    Args:
+        config: sizes.
+        min_pixels: a slot that gets less than this is hidden; it keeps what it had.
+    """
+
+    def __init__(self, config: ParserConfig, min_pixels: float = 3.0) -> None:
+        super().__init__()
+        content = config.layout.content
+        self.cells = config.glimpse_size
+        self.extent = config.glimpse_extent
+        self.min_pixels = min_pixels
+        self.attend = PlaceAttention()
+        self.values = nn.Sequential(
+            nn.Linear(2 * self.cells**2, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, content),
+        )
+        self.gru = nn.GRUCell(content, content)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(content),
+            nn.Linear(content, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, content),
+        )
+
+    def forward(
+        self, frames: Tensor, state: SlotState, attention: Tensor | None = None
+    ) -> tuple[SlotState, Tensor]:
+        """The corrected slots and the attention (B, K, H, W) for frames (B, 3, H, W).
+
+        Args:
+            attention: use this attention instead of computing it (first frame: the clusters themselves).
+        """
+        if attention is None:
+            attention = self.attend(frames, state)
+        seen = state.is_thing & (attention.sum((2, 3))[..., None] >= self.min_pixels)
+        position, scale = moments(attention)
+        position = torch.where(seen, position, state.position)
+        scale = torch.where(seen, scale, state.scale)
+
+        values_BKC = self.values(self._glimpses(frames, attention, position, scale, state.color).flatten(2))
+        B, K, C = values_BKC.shape
+        content = self.gru(values_BKC.reshape(B * K, C), state.content.reshape(B * K, C)).view(B, K, C)
+        content = content + self.mlp(content)
+        content = torch.where(seen, content, state.content)
+        return SlotState(content, state.color, position, scale, state.presence), attention
+
+    def _glimpses(
+        self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor
+    ) -> Tensor:
+        luminance_B1HW = ((frames + 1) / 2).mean(1, keepdim=True)
+        own_BK11 = ((color + 1) / 2).mean(-1)[..., None, None]
+        shading_BKHW = attention * (luminance_B1HW / own_BK11.clamp_min(0.05) - 1).clamp(-1, 2)
+        return crop(torch.stack([attention, shading_BKHW], dim=2), position, scale, self.cells, self.extent)
+
+
+class PlacedTransition(nn.Module):
+    """One transformer block between frames; starts as "nothing changes"."""
+
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        content = config.layout.content
+        width = 2 * content
+        self.inputs = nn.Linear(content + 5, width)
+        self.block = nn.TransformerEncoderLayer(
+            width,
+            config.transition_heads,
+            config.transition_hidden,
+            dropout=0.0,
+            batch_first=True,
+            norm_first=True,
+        )
+        self.outputs = nn.Linear(width, content + 4)
+        nn.init.zeros_(self.outputs.weight)
+        nn.init.zeros_(self.outputs.bias)
+
+    def forward(self, state: SlotState) -> SlotState:
+        """Where the slots (B, K) are expected in the next frame."""
+        tokens = torch.cat([state.content, state.position, state.scale.log(), state.presence], dim=-1)
+        unused = state.presence[..., 0] < 0.5
+        change = self.outputs(self.block(self.inputs(tokens), src_key_padding_mask=unused))
+        content, position, log_scale = change.split([state.content.shape[-1], 2, 2], dim=-1)
+        moves = state.is_thing
+        return SlotState(
+            torch.where(moves, state.content + content, state.content),
+            state.color,
+            torch.where(moves, state.position + position, state.position),
+            torch.where(moves, state.scale * log_scale.exp(), state.scale),
+            state.presence,
+        )
+
+
+class PlacedParser(SceneParser):
+    """Clusters on the first frame, then transition and correction on every later one."""
+
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        if not config.layout.explicit:
+            raise ValueError("parser.corrector 'placed' needs parser.layout.explicit")
+        if config.initializer != "cluster":
+            raise ValueError(
+                "parser.corrector 'placed' starts from clusters: set parser.initializer to 'cluster'"
+            )
+        self.config = config
+        self.layout = config.layout
+        self.initializer = ClusterInitializer()
+        self.corrector = PlacedCorrector(config)
+        self.transition = PlacedTransition(config)
+
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Parsed:
+        """Parse clips; see `SceneParser.forward`. Nothing is drawn at random here: `generator` changes nothing."""
+        state, attention = self.first(frames_BT3HW[:, 0], num_slots or self.config.num_slots)
+        slots, attentions, expectations = [state.join()], [attention], []
+        for t in range(1, frames_BT3HW.shape[1]):
+            expected = self.transition(state)
+            state, attention = self.corrector(frames_BT3HW[:, t], expected)
+            slots.append(state.join())
+            attentions.append(attention)
+            expectations.append(expected.join())
+        slots_BTKD = torch.stack(slots, 1)
+        expected_BTKD = torch.stack(expectations, 1) if expectations else slots_BTKD[:, 1:]
+        return Parsed(slots_BTKD, torch.stack(attentions, 1), expected_BTKD)
+
+    def first(self, frames: Tensor, num_slots: int) -> tuple[SlotState, Tensor]:
+        """The slots of the first frames (B, 3, H, W), and their attention (B, K, H, W)."""
+        clusters = self.initializer(frames, num_slots)
+        B, K = clusters.presence.shape
+        weights_BKN = clusters.masks.flatten(2) / clusters.masks.sum((2, 3))[..., None].clamp_min(1)
+        color = weights_BKN @ frames.flatten(2).transpose(1, 2)
+        position, scale = moments(clusters.masks)
+        presence = clusters.presence[..., None].clone()
+        presence[:, 0] = PRESENCE_BACKGROUND
+        is_thing = (presence > 0.5) & (presence < 1.5)
+        # The canvas fills the frame, an unused slot sits in its middle: constants, nothing to learn there.
+        position = torch.where(is_thing, position, torch.zeros_like(position))
+        scale = torch.where(is_thing, scale, torch.full_like(scale, 0.5))
+        content = frames.new_zeros(B, K, self.layout.content)
+        return self.corrector(frames, SlotState(content, color, position, scale, presence), clusters.masks)

@@ -1,0 +1,294 @@
+"""The published scene parser: slot attention for video (SAVi; TextOCVP section 3.1 and appendix).
+
+frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transition -> next frame's guess
+                                     ^ first frame: GaussianInitializer or clusters
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from textocvp.config import ParserConfig
+from textocvp.layers import PositionCode
+from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
+from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
+
+
+class ConvEncoder(nn.Module):
+    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code,
+    location-wise MLP.
+
+    Args:
+        channels: width of the convolutions (32 in the paper).
+        stride: stride of the first one (1 in the paper: features at every pixel).
+        out_dim: D, the slots' width.
+    """
+
+    def __init__(self, channels: int, stride: int, out_dim: int) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, channels, 5, stride=stride, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+        )
+        for module in self.convolutions:
+            if isinstance(module, nn.Conv2d):
+                # PyTorch's own initialisation shrinks the picture layer by layer, until the position code drowns it.
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        self.position = PositionCode(channels)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(channels), nn.Linear(channels, out_dim), nn.ReLU(), nn.Linear(out_dim, out_dim)
+        )
+
+    def forward(self, frames_N3HW: Tensor) -> Tensor:
+        features_NCHW = self.position(self.convolutions(frames_N3HW))
+        return self.mlp(features_NCHW.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class FeatureProjection(nn.Module):
+    """Features of a frozen encoder (N, F, h, w) to those that slots compete for (N, D, h, w): a location-wise MLP.
+
+    They know their places already, so there is no position code.
+    """
+
+    def __init__(self, feature_dim: int, out_dim: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(feature_dim),
+            nn.Linear(feature_dim, feature_dim),
+            nn.ReLU(),
+            nn.Linear(feature_dim, out_dim),
+        )
+
+    def forward(self, features_NFhw: Tensor) -> Tensor:
+        return self.mlp(features_NFhw.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class SlotAttention(nn.Module):
+    """The corrector: slots compete for locations, then each is updated with the mean of what it won.
+
+    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the
+    locations; the update is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
+    """
+
+    def __init__(self, slot_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.norm_features = nn.LayerNorm(slot_dim)
+        self.norm_slots = nn.LayerNorm(slot_dim)
+        self.norm_mlp = nn.LayerNorm(slot_dim)
+        self.query = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.key = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.value = nn.Linear(slot_dim, slot_dim, bias=False)
+        self.gru = nn.GRUCell(slot_dim, slot_dim)
+        self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
+
+    def forward(
+        self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, given_BKL: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
+        slots.
+
+        Args:
+            given_BKL: the attention of all iterations, where it is known (clusters); sums to 1 over the slots.
+
+        Raises:
+            ValueError: if `iterations` is below 1.
+        """
+        if iterations < 1:
+            raise ValueError(f"slot attention needs at least 1 iteration, not {iterations}")
+        B, K, D = slots_BKD.shape
+        features_BLD = self.norm_features(features_BLD)
+        keys_BLD, values_BLD = self.key(features_BLD), self.value(features_BLD)
+        for _ in range(iterations):
+            if given_BKL is not None:
+                attention_BKL = given_BKL
+            else:
+                queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
+                attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
+            # The small constant keeps a slot that won nothing at the mean of all locations instead of at 0/0.
+            weights_BKL = attention_BKL + 1e-8
+            weights_BKL = weights_BKL / weights_BKL.sum(dim=-1, keepdim=True)
+            updates_BKD = weights_BKL.to(values_BLD.dtype) @ values_BLD
+            slots_BKD = self.gru(updates_BKD.flatten(0, 1), slots_BKD.flatten(0, 1)).view(B, K, D)
+            slots_BKD = slots_BKD + self.mlp(self.norm_mlp(slots_BKD))
+        return slots_BKD, attention_BKL
+
+
+class SaviParser(SceneParser):
+    """Slot attention for video over clips.
+
+    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
+    unless the same generator state is given. With `cluster` the clusters are the attention on the first frame, and
+    slots compete for locations from the second frame on.
+
+    Raises:
+        ValueError: if the layout has explicit channels (this corrector gives content only), or the
+            initializer is unknown.
+    """
+
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        if config.layout.explicit:
+            raise ValueError("parser.corrector 'slot_attention' needs parser.layout.explicit = false")
+        if config.initializer not in ("gaussian", "cluster"):
+            raise ValueError(f"unknown parser.initializer {config.initializer!r}; known: gaussian, cluster")
+        if config.encoder not in ("conv", "dinov2"):
+            raise ValueError(f"unknown parser.encoder {config.encoder!r}; known: conv, dinov2")
+        self.config = config
+        self.layout = config.layout
+        dim = config.layout.dim
+        self.dino: DinoEncoder | None = None
+        if config.encoder == "dinov2":
+            self.dino = DinoEncoder(
+                config.encoder_weights or DINO_HUB_ID,
+                dim=config.encoder_dim,
+                patch=config.encoder_patch,
+                fingerprint=config.encoder_fingerprint,
+            )
+            self.cells = self.dino.cells(config.image_size)
+            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(config.encoder_dim, dim)
+        else:
+            self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
+        if config.initializer == "gaussian":
+            self.initializer: GaussianInitializer | ClusterSlots = GaussianInitializer(dim)
+        else:
+            self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
+        self.corrector = SlotAttention(dim, hidden=2 * dim)
+        # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
+        self.transition = nn.TransformerEncoderLayer(
+            dim,
+            config.transition_heads,
+            config.transition_hidden,
+            dropout=0.0,
+            batch_first=True,
+            norm_first=True,
+        )
+
+    @property
+    def encoder_fingerprint(self) -> str:
+        return self.dino.fingerprint if self.dino else ""
+
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        *,
+        num_slots: int | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        features_BTLF: Tensor | None = None,
+    ) -> Parsed:
+        """Parse clips; see `SceneParser.forward`.
+
+        Args:
+            features_BTLF: of the frozen encoder, where they are known already; its weights are then not needed.
+
+        Raises:
+            ValueError: if features are given to a parser that learns its encoder.
+        """
+        B, T = frames_BT3HW.shape[:2]
+        K = self.config.num_slots if num_slots is None else num_slots
+        if self.dino is None:
+            if features_BTLF is not None:
+                raise ValueError("features are for a parser with a frozen encoder: parser.encoder is 'conv'")
+            seen_BTCHW = frames_BT3HW
+        else:
+            if features_BTLF is None:
+                features_BTLF = self.dino(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
+            seen_BTCHW = features_BTLF.transpose(2, 3).unflatten(3, (self.cells, self.cells))
+        features_NDhw = self.encoder(seen_BTCHW.flatten(0, 1))
+        h, w = features_NDhw.shape[-2:]
+        features_BTLD = features_NDhw.flatten(2).transpose(1, 2).unflatten(0, (B, T))
+
+        clusters_BKL = None
+        if isinstance(self.initializer, GaussianInitializer):
+            guess_BKD = self.initializer(B, K, generator)
+        else:
+            first_BDhw = features_NDhw.unflatten(0, (B, T))[:, 0]
+            guess_BKD, clusters_BKL = self.initializer(seen_BTCHW[:, 0], first_BDhw, K)
+        slots, attention = [], []
+        for t in range(T):
+            rounds = self.config.iterations_first if t == 0 else self.config.iterations_next
+            given_BKL = clusters_BKL if t == 0 else None
+            slots_BKD, attention_BKL = self.corrector(guess_BKD, features_BTLD[:, t], rounds, given_BKL)
+            slots.append(slots_BKD)
+            attention.append(attention_BKL.unflatten(2, (h, w)))
+            if t + 1 < T:
+                guess_BKD = self.transition(slots_BKD)
+        return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1), features_BTLF=features_BTLF)
+
+
+class GaussianInitializer(nn.Module):
+    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test
+    time."""
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
+
+    def forward(
+        self,
+        batch: int,
+        num_slots: int,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
+        """(batch, num_slots, D) slots."""
+        if isinstance(generator, Sequence):
+            noise_KD = [
+                torch.randn(num_slots, self.mean.shape[0], generator=g, device=g.device) for g in generator
+            ]
+            return self.mean + self.log_deviation.exp() * torch.stack(noise_KD).to(self.mean)
+        noise_BKD = torch.randn(
+            batch,
+            num_slots,
+            self.mean.shape[0],
+            generator=generator,
+            device=self.mean.device,
+            dtype=self.mean.dtype,
+        )
+        return self.mean + self.log_deviation.exp() * noise_BKD
+
+
+class ClusterSlots(nn.Module):
+    """First slots from clusters: the mean feature of each cluster, through a small MLP.
+
+    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
+    family a slot has no presence that could switch it off.
+
+    Args:
+        slot_dim: D.
+        clusters: finds them in what `forward` is given.
+    """
+
+    def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
+        super().__init__()
+        self.clusters = clusters
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
+        )
+        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+
+    def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
+        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers.
+
+        Args:
+            seen_BCHW: what is divided into clusters: frames, or the features of a frozen encoder.
+            features_BDhw: whose means the slots are made of.
+        """
+        found = self.clusters(seen_BCHW, num_slots)
+        shares_BKL = F.adaptive_avg_pool2d(
+            found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
+        ).flatten(2)
+        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
+        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
+        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL

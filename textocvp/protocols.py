@@ -1,0 +1,64 @@
+"""What every model of the comparison can do, with slots or without: watch a frame, read a sentence, imagine frames.
+
+`WorldModel` can, for everything that has slots; the holistic baselines have a class of their own. The studies of
+prediction quality know no more of a model than this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from textocvp.baselines.mage.config import ARCHITECTURE
+from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, read_json, resolve_checkpoint
+from textocvp.world_model import WorldModel
+
+
+class VideoModel(Protocol):
+    """A video prediction model.
+
+    Attributes:
+        checkpoint: where it came from.
+    """
+
+    checkpoint: Checkpoint
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) of the only frames that it understands, in pixels."""
+
+    @property
+    def longest_horizon(self) -> int | None:
+        """How many frames it can imagine at once; None for as many as you like."""
+
+    def imagine(
+        self, obs: Mapping[str, Any] | np.ndarray, text: str | Sequence[str], *, horizon: int, seed: int = 0
+    ) -> Tensor:
+        """Frames (B, horizon + 1, 3, H, W), RGB 0..1, float32. Frame 0 is the observed one as the model redraws it.
+
+        Args:
+            obs: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images (B, H, W, 3), uint8.
+            text: what is to be done; one sentence, or one for each image.
+            horizon: how many frames to imagine.
+            seed: of whatever the model draws at random.
+
+        Raises:
+            TypeError, ValueError: as `WorldModel.rollout`.
+        """
+
+
+def load_model(
+    name_or_folder_or_hub_id: str | Path = DEFAULT_CHECKPOINT, device: str | torch.device = "cpu"
+) -> VideoModel:
+    """The model of a checkpoint, whatever its architecture; arguments and errors as `WorldModel.from_pretrained`."""
+    name = str(name_or_folder_or_hub_id)
+    with resolve_checkpoint(name) as folder:
+        if read_json(folder).get("architecture") == ARCHITECTURE:
+            return MageVideoModel.from_folder(folder, name, device)
+    return WorldModel.from_pretrained(name, device)

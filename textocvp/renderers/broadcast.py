@@ -1,0 +1,54 @@
+"""The published renderer: a spatial broadcast decoder (Watters et al. 2019; TextOCVP-SAVi).
+
+Every slot is copied to every pixel, told where that pixel is, and decoded by four convolutions to a colour
+and an alpha; the alphas of all slots become masks by a softmax over the slots.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from textocvp.config import RendererConfig
+from textocvp.layers import PositionCode
+from textocvp.renderers.base import Rendered, Renderer
+from textocvp.slots import SlotLayout
+
+
+class BroadcastRenderer(Renderer):
+    """Four 5x5 convolutions with `config.channels` at full resolution, then one to RGB and alpha.
+
+    Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
+
+    Args:
+        config: `channels`.
+        layout: gives the slots' width.
+        image_size: side of the frames in pixels.
+    """
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        self.image_size = image_size
+        slot_dim, channels = layout.dim, config.channels
+        self.position = PositionCode(slot_dim)
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(slot_dim, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 5, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(channels, 4, 3, padding=1),
+        )
+
+    def forward(self, slots_BKD: Tensor) -> Rendered:
+        B, K, D = slots_BKD.shape
+        size = self.image_size
+        map_NDHW = slots_BKD.reshape(B * K, D, 1, 1).expand(-1, -1, size, size)
+        out_BK4HW = self.convolutions(self.position(map_NDHW)).view(B, K, 4, size, size)
+        object_frames_BK3HW = out_BK4HW[:, :, :3]
+        masks_BKHW = torch.softmax(out_BK4HW[:, :, 3].float(), dim=1)  # float: bf16 masks would not sum to 1
+        frames_B3HW = (masks_BKHW[:, :, None] * object_frames_BK3HW).sum(dim=1)
+        return Rendered(frames_B3HW, masks_BKHW, lambda: object_frames_BK3HW)

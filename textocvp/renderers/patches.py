@@ -1,0 +1,205 @@
+"""An MLP that draws patch by patch: every slot is copied to every cell of a coarse grid (the decoder of DINOSAUR,
+Seitzer et al. 2023; TextOCVP-DINO), and the renderer that fills the cells with pixels.
+
+On a CPU this is many times faster than convolutions at full resolution, because nothing wider than four channels ever
+exists at pixel resolution.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from textocvp.config import RendererConfig
+from textocvp.layers import pixel_grid
+from textocvp.renderers.base import Rendered, Renderer
+from textocvp.renderers.image_decoders import build_image_decoder
+from textocvp.slots import SlotLayout
+
+FREQUENCIES = 4
+MIN_SCALE = 0.02
+"""Smallest standard deviation of the mask prior, in -1..1: two thirds of a pixel at 64x64."""
+
+
+def position_code(cells: int) -> Tensor:
+    """(cells * cells, 2 + 4 * FREQUENCIES): coordinates of the cells in -1..1, plain and as sines and cosines."""
+    grid_L2 = pixel_grid(cells, cells).flatten(0, 1)
+    waves = [grid_L2 * (math.pi * 2**i / 2) for i in range(FREQUENCIES)]
+    return torch.cat([grid_L2, *(wave.sin() for wave in waves), *(wave.cos() for wave in waves)], dim=-1)
+
+
+class PatchDecoder(nn.Module):
+    """Slots (B, K, D) to `out_dim` numbers at each of `cells` x `cells` places, (B, K, L, out_dim).
+
+    The MLP's input is a slot beside the code of a place. Its first layer is linear in both, so it is computed once a
+    slot and once a place and added: the same function without the L times K copies of the slots.
+
+    Args:
+        slot_dim: D.
+        cells: side of the grid; L = cells * cells, row by row.
+        layers: linear layers of the MLP, at least 2.
+        hidden: their width.
+        out_dim: numbers a place.
+
+    Raises:
+        ValueError: if there are fewer than 2 layers.
+    """
+
+    codes_LC: Tensor
+
+    def __init__(self, slot_dim: int, cells: int, layers: int, hidden: int, out_dim: int) -> None:
+        super().__init__()
+        if layers < 2:
+            raise ValueError(f"renderer.layers must be at least 2, not {layers}")
+        codes_LC = position_code(cells)
+        self.register_buffer("codes_LC", codes_LC, persistent=False)
+        self.slot = nn.Linear(slot_dim, hidden)
+        self.place = nn.Linear(codes_LC.shape[-1], hidden, bias=False)
+        inner: list[nn.Module] = [nn.ReLU()]
+        for _ in range(layers - 2):
+            inner += [nn.Linear(hidden, hidden), nn.ReLU()]
+        self.rest = nn.Sequential(*inner, nn.Linear(hidden, out_dim))
+
+    def forward(self, slots_BKD: Tensor, first: int | None = None) -> Tensor:
+        """All `out_dim` numbers of every place, or only the first so many."""
+        *inner, last = self.rest
+        hidden_BKLH = self.slot(slots_BKD)[:, :, None] + self.place(self.codes_LC)
+        for layer in inner:
+            hidden_BKLH = layer(hidden_BKLH)
+        assert isinstance(last, nn.Linear)
+        return F.linear(hidden_BKLH, last.weight[:first], last.bias[:first])
+
+
+class SlotPlace(nn.Module):
+    """Reads a place and a size off a slot whose numbers are unexplained: one linear layer.
+
+    What they should be is known: mean and standard deviation of the grid under the slot's attention. Stage 1 holds
+    them to that (`textocvp.training.losses.read_place_loss`), and the image loss corrects them.
+    """
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.read = nn.Linear(slot_dim, 4)
+        nn.init.zeros_(self.read.bias)
+
+    def forward(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre (x, y) in -1..1 and standard deviation along x and y in that unit, each (B, K, 2)."""
+        position, scale = self.read(slots_BKD).float().split(2, dim=-1)
+        return position.tanh(), MIN_SCALE + F.softplus(scale - 1)  # 0.33 for a slot that says nothing
+
+
+def gaussian_prior(position_BK2: Tensor, scale_BK2: Tensor, height: int, width: int) -> Tensor:
+    """(B, K, height, width): the logarithm of each slot's Gaussian at each pixel, up to a constant."""
+    grid_HW2 = pixel_grid(height, width, device=position_BK2.device)
+    x_BKW = ((grid_HW2[0, :, 0] - position_BK2[..., :1]) / scale_BK2[..., :1]).square() / 2
+    y_BKH = ((grid_HW2[:, 0, 1] - position_BK2[..., 1:]) / scale_BK2[..., 1:]).square() / 2
+    x_BKW = x_BKW + scale_BK2.log().sum(-1, keepdim=True)
+    return -(x_BKW[:, :, None, :] + y_BKH[..., None])
+
+
+class PatchRenderer(Renderer):
+    """Every slot to a grid of patches of pixels (RGB and alpha); the alphas of all slots become masks by a softmax.
+
+    Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
+
+    Args:
+        config: `patches`, `layers`, `hidden` and `mask_prior`.
+        layout: gives the slots' width.
+        image_size: side of the frames in pixels, a multiple of `config.patches`.
+
+    Raises:
+        ValueError: if the patches do not divide the frame.
+    """
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        if image_size % config.patches:
+            raise ValueError(
+                f"renderer.patches: {config.patches} patches do not divide {image_size} pixels evenly"
+            )
+        self.cells, self.side = config.patches, image_size // config.patches
+        out_dim = 4 * self.side**2
+        self.decoder = PatchDecoder(layout.dim, self.cells, config.layers, config.hidden, out_dim)
+        self.place = SlotPlace(layout.dim) if config.mask_prior else None
+
+    def forward(self, slots_BKD: Tensor) -> Rendered:
+        B, K, _ = slots_BKD.shape
+        n, s = self.cells, self.side
+        patches = self.decoder(slots_BKD).view(B, K, n, n, 4, s, s)
+        alpha_BKHW = patches[:, :, :, :, 3].transpose(3, 4).reshape(B, K, n * s, n * s).float()
+        if self.place is not None:
+            position_BK2, scale_BK2 = self.place(slots_BKD)
+            alpha_BKHW = alpha_BKHW + gaussian_prior(position_BK2, scale_BK2, n * s, n * s)
+        masks_BKHW = torch.softmax(alpha_BKHW, dim=1)
+        # Composed patch by patch: only the sum, not every slot's picture, is put together to a frame.
+        shares = masks_BKHW.view(B, K, n, s, n, s).transpose(3, 4)[:, :, :, :, None]
+        composed_Bnn3ss = (shares * patches[:, :, :, :, :3]).sum(1)
+
+        def draw_objects() -> Tensor:
+            return patches[:, :, :, :, :3].permute(0, 1, 4, 2, 5, 3, 6).reshape(B, K, 3, n * s, n * s)
+
+        frames_B3HW = composed_Bnn3ss.permute(0, 3, 1, 4, 2, 5).reshape(B, 3, n * s, n * s)
+        return Rendered(frames_B3HW, masks_BKHW, draw_objects)
+
+    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
+        return None if self.place is None else self.place(slots_BKD)
+
+
+class FeatureRenderer(Renderer):
+    """Slots (B, K, D) to features (B, L, F), masks and frames.
+
+    Slots are exchangeable: reordering them reorders masks and object frames and leaves features and frame as they are.
+
+    Args:
+        config: `patches` (L is its square), `layers`, `hidden`, `mask_prior`, `feature_dim`, `image_decoder` and
+            `image_channels`.
+        layout: gives the slots' width.
+        image_size: side of the frames in pixels.
+    """
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        self.cells, self.image_size = config.patches, image_size
+        # The alpha comes first, so that masks can be had without the features.
+        self.decoder = PatchDecoder(
+            layout.dim, config.patches, config.layers, config.hidden, 1 + config.feature_dim
+        )
+        self.place = SlotPlace(layout.dim) if config.mask_prior else None
+        self.image_decoder = build_image_decoder(
+            config.image_decoder, config.feature_dim, config.image_channels, image_size
+        )
+
+    def forward(self, slots_BKD: Tensor) -> Rendered:
+        out_BKLC = self.decoder(slots_BKD)
+        shares_BKL = self._shares(out_BKLC[..., 0], slots_BKD)
+        own_BKLF = out_BKLC[..., 1:]
+        features_BLF = (shares_BKL[..., None] * own_BKLF).sum(1)
+
+        def draw_objects() -> Tensor:
+            return self._picture(own_BKLF.flatten(0, 1)).unflatten(0, own_BKLF.shape[:2])
+
+        return Rendered(self._picture(features_BLF), self._enlarged(shares_BKL), draw_objects, features_BLF)
+
+    def masks(self, slots_BKD: Tensor) -> Tensor:
+        return self._enlarged(self._shares(self.decoder(slots_BKD, first=1)[..., 0], slots_BKD))
+
+    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
+        return None if self.place is None else self.place(slots_BKD)
+
+    def _shares(self, alpha_BKL: Tensor, slots_BKD: Tensor) -> Tensor:
+        alpha_BKL = alpha_BKL.float()  # bf16 masks would not sum to 1
+        if self.place is not None:
+            position_BK2, scale_BK2 = self.place(slots_BKD)
+            alpha_BKL = alpha_BKL + gaussian_prior(position_BK2, scale_BK2, self.cells, self.cells).flatten(2)
+        return torch.softmax(alpha_BKL, dim=1)
+
+    def _picture(self, features_NLF: Tensor) -> Tensor:
+        return self.image_decoder(features_NLF.transpose(1, 2).unflatten(2, (self.cells, self.cells)))
+
+    def _enlarged(self, shares_BKL: Tensor) -> Tensor:
+        masks_BKhw = shares_BKL.unflatten(2, (self.cells, self.cells))
+        size = (self.image_size, self.image_size)
+        return F.interpolate(masks_BKhw, size=size, mode="bilinear", align_corners=False)

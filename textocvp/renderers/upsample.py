@@ -1,0 +1,66 @@
+"""The renderer of Non-OC: one slot holds the whole frame, and convolutions unfold it."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from textocvp.config import RendererConfig
+from textocvp.layers import init_relu_
+from textocvp.renderers.base import Rendered, Renderer
+from textocvp.slots import SlotLayout
+
+CELLS = 8
+"""Side of the picture that the linear layer makes."""
+
+
+class UpsampleRenderer(Renderer):
+    """A linear layer to 8x8 cells, then doublings up to the frame, each a convolution.
+
+    The last doubling is a pixel shuffle: on a CPU that takes half the time of convolutions at full resolution.
+
+    Args:
+        config: `channels`, the width at half the frame's size; it is twice that below.
+        layout: gives the slot's width.
+        image_size: side of the frames, 16, 32, 64, ... pixels.
+
+    Raises:
+        ValueError: if the layout has explicit channels, or the frames have another size.
+    """
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        if layout.explicit:
+            raise ValueError("renderer.kind 'upsample' needs parser.layout.explicit = false")
+        doublings = (image_size // CELLS).bit_length() - 1
+        if doublings < 1 or image_size != CELLS * 2**doublings:
+            raise ValueError(
+                f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {image_size}"
+            )
+        wide = 2 * config.channels
+        self.image_size = image_size
+        self.cells = nn.Sequential(
+            nn.Linear(layout.dim, wide * CELLS**2), nn.Unflatten(1, (wide, CELLS, CELLS))
+        )
+        blocks: list[nn.Module] = []
+        for doubling in range(doublings - 1):
+            width = config.channels if doubling == doublings - 2 else wide
+            blocks += [nn.ReLU(), nn.Upsample(scale_factor=2.0), nn.Conv2d(wide, width, 3, padding=1)]
+        last = wide if doublings == 1 else config.channels
+        blocks += [nn.ReLU(), nn.Conv2d(last, 3 * 4, 3, padding=1), nn.PixelShuffle(2)]
+        self.convolutions = nn.Sequential(*blocks)
+        init_relu_(self)
+
+    def forward(self, slots_B1D: Tensor) -> Rendered:
+        """See `Renderer`.
+
+        Raises:
+            ValueError: if there is more than one slot.
+        """
+        if slots_B1D.shape[1] != 1:
+            raise ValueError(f"renderer.kind 'upsample' draws one slot, not {slots_B1D.shape[1]}")
+        frames_B3HW = self.convolutions(self.cells(slots_B1D[:, 0]))
+        return Rendered(frames_B3HW, self.masks(slots_B1D), lambda: frames_B3HW[:, None])
+
+    def masks(self, slots_B1D: Tensor) -> Tensor:
+        """The one mask: the slot has every pixel."""
+        return slots_B1D.new_ones(len(slots_B1D), 1, self.image_size, self.image_size)

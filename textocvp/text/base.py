@@ -1,0 +1,167 @@
+"""From sentences to tokens: the interface that every text encoder has, and the one place that picks one.
+
+Four kinds (`TextConfig.kind`). `transformer` and `lexicon` read words and are trained from scratch
+(`textocvp.text.words`); `t5` and `minilm` read subwords and come pretrained (`textocvp.text.pretrained`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from textocvp.config import TextConfig
+
+RGB = tuple[float, float, float]
+
+
+@dataclass
+class TextTokens:
+    """A batch of encoded sentences.
+
+    Attributes:
+        embeddings_BLC: contextual token embeddings; zero where there is no token.
+        mask_BL: True where there is a token: a word, or for the pretrained encoders a subword or end mark.
+        colors_BL3: RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere).
+        names_color_BL: True where `colors_BL3` means something.
+    """
+
+    embeddings_BLC: Tensor
+    mask_BL: Tensor
+    colors_BL3: Tensor
+    names_color_BL: Tensor
+
+    def select(self, index: Tensor | slice) -> TextTokens:
+        """A sub-batch."""
+        return TextTokens(
+            self.embeddings_BLC[index],
+            self.mask_BL[index],
+            self.colors_BL3[index],
+            self.names_color_BL[index],
+        )
+
+    def __len__(self) -> int:
+        return self.mask_BL.shape[0]
+
+
+@dataclass
+class WordBatch:
+    """Sentences before encoding: what the lexicon says about every word, still free of learned parameters.
+
+    Attributes:
+        ids_BL: row in the encoder's vocabulary, `pad` of the encoder where there is no word.
+        colors_BL3, names_color_BL: as in `TextTokens`.
+    """
+
+    ids_BL: Tensor
+    colors_BL3: Tensor
+    names_color_BL: Tensor
+
+    def select(self, index: Tensor | slice) -> WordBatch:
+        """A sub-batch."""
+        return WordBatch(self.ids_BL[index], self.colors_BL3[index], self.names_color_BL[index])
+
+    def permute_channels(self, order_B3: Tensor) -> WordBatch:
+        """Each sentence's colours with their RGB channels reordered (training augmentation)."""
+        index_BL3 = order_B3[:, None, :].expand_as(self.colors_BL3)
+        return replace(self, colors_BL3=self.colors_BL3.gather(-1, index_BL3))
+
+    def to(self, device: torch.device | str) -> WordBatch:
+        return WordBatch(self.ids_BL.to(device), self.colors_BL3.to(device), self.names_color_BL.to(device))
+
+
+class TextEncoder(nn.Module):
+    """Sentences to `TextTokens`. Subclasses write `words`, `encode` and `_rows`.
+
+    Padding is masked everywhere (the authors' code does not mask it in the cross-attention), so what a
+    sentence means does not depend on its neighbours in the batch.
+
+    Attributes:
+        config: what it was built from; of a frozen pretrained encoder also the fingerprint of its weights.
+        pad: the row in the vocabulary that stands for no token.
+        unit: what one token is called.
+        words_have_rgb: whether colour words carry their RGB. Only then do they still fit a scene whose colours are
+            changed, and only then can slots be matched with words by colour.
+    """
+
+    config: TextConfig
+    pad: int = 0
+    unit: str = "word"
+    words_have_rgb: bool = False
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Where its learned parameters are."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def words(self, text: str) -> list[str]:
+        """What each token of a sentence stands for, in order."""
+        raise NotImplementedError
+
+    def unknown_words(self, text: str) -> list[str]:
+        """The words that mean nothing to this encoder, in order, each once: for a warning that names them.
+
+        Encoders that read subwords can spell any word, and know none to be unknown.
+        """
+        return []
+
+    @abstractmethod
+    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
+        """Of each token its row in the vocabulary, and the RGB (0..1) that it names; nothing for an empty text."""
+        raise NotImplementedError
+
+    def lookup(self, texts: Sequence[str]) -> WordBatch:
+        """Vocabulary rows and lexicon colours of the sentences, padded to the longest.
+
+        Raises:
+            ValueError: if a sentence has no word at all or more than `max_tokens` tokens.
+        """
+        if isinstance(texts, str):
+            raise TypeError("texts must be a sequence of sentences, not one string")
+        sentences = [self._rows(text) for text in texts]
+        for text, sentence in zip(texts, sentences, strict=True):
+            if not sentence:
+                raise ValueError(f"a text needs at least one word, got {text!r}")
+            self._check_length(len(sentence), "this")
+        shape = (len(sentences), max(map(len, sentences), default=1))
+        ids_BL, colors_BL3 = torch.full(shape, self.pad), torch.zeros(*shape, 3)
+        names_color_BL = torch.zeros(shape, dtype=torch.bool)
+        for b, sentence in enumerate(sentences):
+            for position, (row, color) in enumerate(sentence):
+                ids_BL[b, position] = row
+                if color is not None:
+                    colors_BL3[b, position] = torch.tensor(color) * 2 - 1
+                    names_color_BL[b, position] = True
+        return WordBatch(ids_BL, colors_BL3, names_color_BL).to(self.device)
+
+    def _check_length(self, tokens: int, what: str) -> None:
+        if tokens > self.config.max_tokens:
+            raise ValueError(
+                f"a text may have at most {self.config.max_tokens} {self.unit}s, {what} has {tokens}"
+            )
+
+    @abstractmethod
+    def encode(self, words: WordBatch) -> TextTokens:
+        """Embed looked-up words.
+
+        Raises:
+            ValueError: if they are more than `max_tokens`.
+        """
+        raise NotImplementedError
+
+    def forward(self, texts: Sequence[str]) -> TextTokens:
+        """Encode sentences.
+
+        Raises:
+            ValueError: see `lookup`.
+        """
+        return self.encode(self.lookup(texts))
+
+    def save_files(self, folder: Path) -> None:
+        """Write what a checkpoint needs besides tensors into `folder`, which it makes if there is anything."""

@@ -1,0 +1,178 @@
+"""Word-level text encoders trained from scratch.
+
+`transformer`: a learned embedding for every word of the caption grammar and every training colour, then a small
+transformer (the paper finds such an encoder equal to T5 on CATER). `lexicon`: the same, but all colour words share
+one embedding and differ only in the RGB that a public lexicon gives for their name, so a colour that no caption ever
+named is understood like any other.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import cache
+
+import torch
+from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
+from torch import Tensor, nn
+
+from textocvp.config import TextConfig
+from textocvp.layers import FeedForward, SelfAttention, sinusoids
+from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
+
+# Row 0 is padding, so that a padded batch needs no other bookkeeping. The order is part of every checkpoint:
+# append.
+SPECIAL = ("<pad>", "<unk>", "<color>")
+GRAMMAR = (
+    "put",
+    "the",
+    "block",
+    "in",
+    "bowl",
+    "and",
+    "then",
+    "into",
+    "a",
+    "on",
+    "place",
+    "move",
+    "of",
+    "with",
+    "to",
+)
+TRAIN_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
+PAD, UNKNOWN, COLOR = range(3)
+
+_WORD = re.compile(r"[a-z0-9']+")
+
+
+class _Block(nn.Module):
+    """Pre-norm transformer encoder block over the words of a sentence."""
+
+    def __init__(self, config: TextConfig) -> None:
+        super().__init__()
+        self.norm_attention = nn.LayerNorm(config.dim, eps=1e-6)
+        self.attention = SelfAttention(config.dim, config.heads)
+        self.norm_feed_forward = nn.LayerNorm(config.dim, eps=1e-6)
+        self.feed_forward = FeedForward(config.dim, config.hidden)
+
+    def forward(self, x_BLC: Tensor, bias_B11L: Tensor) -> Tensor:
+        x_BLC = x_BLC + self.attention(self.norm_attention(x_BLC), bias_B11L)
+        return x_BLC + self.feed_forward(self.norm_feed_forward(x_BLC))
+
+
+class WordEncoder(TextEncoder):
+    """The kinds `transformer` and `lexicon`: one token a word."""
+
+    pad = PAD
+
+    positions_LC: Tensor
+
+    def __init__(self, config: TextConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.words_have_rgb = config.kind == "lexicon"
+        vocabulary = SPECIAL + GRAMMAR + (TRAIN_COLORS if config.kind == "transformer" else ())
+        self._vocabulary = {word: row for row, word in enumerate(vocabulary)}
+        self.embedding = nn.Embedding(len(vocabulary), config.dim, padding_idx=PAD)
+        nn.init.normal_(self.embedding.weight, std=0.5)
+        with torch.no_grad():
+            self.embedding.weight[PAD].zero_()
+        self.color_projection = nn.Linear(3, config.dim, bias=False) if config.kind == "lexicon" else None
+        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(config.dim, eps=1e-6)
+        self.register_buffer("positions_LC", sinusoids(config.max_tokens, config.dim), persistent=False)
+
+    @property
+    def device(self) -> torch.device:
+        return self.embedding.weight.device
+
+    def words(self, text: str) -> list[str]:
+        """The words of a sentence as the encoder sees them, lower case, one a token.
+
+        A colour name of several words ("light blue") is one token of the `lexicon` encoder.
+        """
+        found = _WORD.findall(text.lower())
+        if self.config.kind != "lexicon":
+            return found
+        merged, at = [], 0
+        while at < len(found):
+            # Words of the grammar stay words, also where some palette calls a colour by one of them.
+            length = 1 if found[at] in self._vocabulary else self._color_length(found, at)
+            merged.append(" ".join(found[at : at + length]))
+            at += length
+        return merged
+
+    def _color_length(self, words: list[str], at: int) -> int:
+        for length in range(min(longest_name(), len(words) - at), 1, -1):
+            if tuple(words[at : at + length]) in palette():
+                return length
+        return 1
+
+    def _row_and_color(self, word: str) -> tuple[int, RGB | None]:
+        if word in self._vocabulary:
+            return self._vocabulary[word], None
+        color = palette().get(tuple(word.split())) if self.config.kind == "lexicon" else None
+        return (UNKNOWN, None) if color is None else (COLOR, color)
+
+    def unknown_words(self, text: str) -> list[str]:
+        return list(dict.fromkeys(w for w in self.words(text) if self._row_and_color(w)[0] == UNKNOWN))
+
+    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
+        return [self._row_and_color(word) for word in self.words(text)]
+
+    def encode(self, words: WordBatch) -> TextTokens:
+        mask_BL = words.ids_BL != PAD
+        length = mask_BL.shape[1]
+        self._check_length(length, "this batch")
+        x_BLC = self.embedding(words.ids_BL)
+        if self.color_projection is not None:
+            x_BLC = x_BLC + self.color_projection(words.colors_BL3) * words.names_color_BL[..., None]
+        x_BLC = x_BLC + self.positions_LC[:length]
+        bias_B11L = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, -math.inf)[
+            :, None, None
+        ]
+        for block in self.blocks:
+            x_BLC = block(x_BLC, bias_B11L)
+        x_BLC = self.norm(x_BLC) * mask_BL[..., None]
+        return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
+
+
+# Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
+# calls # #76b7b2 teal; captions of tabletop scenes call it cyan. It goes by both names.
+TABLEAU_10 = {
+    "blue": "#4e79a7",
+    "orange": "#f28e2b",
+    "red": "#e15759",
+    "teal": "#76b7b2",
+    "cyan": "#76b7b2",
+    "green": "#59a14f",
+    "yellow": "#edc948",
+    "purple": "#b07aa1",
+    "pink": "#ff9da7",
+    "brown": "#9c755f",
+    "gray": "#bab0ac",
+    "grey": "#bab0ac",
+}
+
+
+@cache
+def palette() -> dict[tuple[str, ...], tuple[float, float, float]]:
+    """Colour name, as a tuple of lower-case words, to RGB in 0..1.
+
+    Names that are no words ("blue/green") are left out.
+    """
+    xkcd = {name.removeprefix("xkcd:"): value for name, value in XKCD_COLORS.items()}
+    merged = {**xkcd, **CSS4_COLORS, **TABLEAU_10}  # later palettes win
+    return {tuple(name.split()): to_rgb(value) for name, value in merged.items() if "/" not in name}
+
+
+@cache
+def longest_name() -> int:
+    """Words in the longest colour name."""
+    return max(map(len, palette()))
+
+
+def color_of(name: str) -> tuple[float, float, float] | None:
+    """RGB in 0..1 of a colour name, case ignored; None if no palette has it."""
+    return palette().get(tuple(name.lower().split()))

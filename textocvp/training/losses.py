@@ -1,0 +1,191 @@
+"""What the parser is trained for (stage 1). The predictor's losses live beside its loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from textocvp.renderers.base import Rendered
+from textocvp.slots import SlotLayout, SlotState, moments
+
+
+@dataclass
+class ParserLoss:
+    """The terms of stage 1, each a scalar.
+
+    Attributes:
+        image: mean squared error of the reconstruction, things weighted above the canvas.
+        mask: cross-entropy of the drawn masks against the parser's attention.
+        place: squared error of the places that the transition expected against those the corrector found; for slots
+            without explicit places, of those that the renderer reads off them against those of their attention.
+        feature: mean squared error of the reconstructed features, for renderers that have any.
+    """
+
+    image: Tensor
+    mask: Tensor
+    place: Tensor
+    feature: Tensor
+
+    def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
+        """The weighted sum that is minimised."""
+        return (
+            self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
+        )
+
+    def figures(self) -> dict[str, Tensor]:
+        """The terms, named for a log."""
+        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
+
+
+def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
+    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things.
+
+    A pixel shows a thing where it differs from its image's median colour by more than `threshold`: no labels needed.
+    """
+    median = target.flatten(-2).median(-1).values[..., None, None]
+    thing = (target - median).abs().amax(-3, keepdim=True) > threshold
+    return 1 + thing_weight * thing.to(target.dtype)
+
+
+def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tensor | None = None) -> Tensor:
+    """Weighted mean squared error of the composed frames against frames (B, 3, H, W).
+
+    Args:
+        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
+            up to that of the batch.
+    """
+    whole = weights.sum() if whole is None else whole
+    return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * whole)
+
+
+def mask_loss(
+    rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None
+) -> Tensor:
+    """Weighted cross-entropy of the drawn masks against the attention's winners; no gradient enters the attention.
+
+    The renderer sees only the slots, the attention also the pixels: agreeing with it teaches the renderer where a
+    slot ends long before the image loss alone would, and without labels (self-distillation, as in SPOT, 2024).
+    `whole` is as in `image_loss`.
+    """
+    log_masks = rendered.masks_BKHW.clamp_min(1e-6).log()
+    per_pixel = F.nll_loss(log_masks, attention_BKHW.argmax(1), reduction="none")
+    return (weights[:, 0] * per_pixel).sum() / (weights.sum() if whole is None else whole)
+
+
+def place_loss(expected: SlotState, found: SlotState) -> Tensor:
+    """Mean squared error of expected places and log-sizes, over the things of each clip, then over the clips (B, T, K).
+
+    No gradient enters `found`.
+    """
+    wanted = torch.cat([found.position, found.scale.log()], dim=-1).detach()
+    error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
+    things = found.is_thing[..., 0]
+    error_B = torch.where(things, error, torch.zeros_like(error)).sum((1, 2)) / things.sum((1, 2)).clamp_min(
+        1
+    )
+    return error_B.mean()
+
+
+def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Tensor) -> Tensor:
+    """Mean squared error of places and log-sizes against mean and deviation of the grid under the attention.
+
+    No gradient enters the attention.
+    """
+    center_BK2, deviation_BK2 = moments(attention_BKHW.detach())
+    return ((position_BK2 - center_BK2).square() + (scale_BK2 / deviation_BK2).log().square()).mean()
+
+
+MOVES = (
+    0.015  # a slot moves when its centre shifts by more than this in a frame, in -1..1: half a pixel of 64
+)
+UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
+
+
+@dataclass
+class SlotLoss:
+    """The terms, each a scalar averaged over slots with the weights of the moving ones.
+
+    Attributes:
+        position: Huber loss of the centre, in units of about a pixel.
+        scale: squared error of the log-scale, in tenths.
+        content: squared error of the content in units of its standard deviation (of the content as it is where
+            none is given). Without explicit channels the whole slot is content.
+    """
+
+    position: Tensor
+    scale: Tensor
+    content: Tensor
+
+    def total(self, scale_weight: float, content_weight: float) -> Tensor:
+        """The weighted sum that is minimised."""
+        return self.position + scale_weight * self.scale + content_weight * self.content
+
+    def figures(self) -> dict[str, Tensor]:
+        """The terms, named for a log."""
+        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
+
+
+def slot_loss(
+    predicted_BTKD: Tensor,
+    target_BTKD: Tensor,
+    weights_BTK: Tensor,
+    layout: SlotLayout,
+    content_std_C: Tensor | None,
+    *,
+    whole: Tensor | float | None = None,
+) -> SlotLoss:
+    """Compare predicted slots with the parser's.
+
+    Args:
+        weights_BTK: how much each slot counts, see `moving_weights`.
+        content_std_C: standard deviation of each content channel over the training slots; None for slots without
+            explicit channels that are compared as they are.
+        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
+            up to that of the batch.
+    """
+    weights_BTK = weights_BTK / (weights_BTK.sum().clamp(min=1e-6) if whole is None else whole)
+    if not layout.explicit:
+        error_BTKD = predicted_BTKD - target_BTKD
+        if content_std_C is not None:
+            error_BTKD = error_BTKD / content_std_C
+        error_BTK = error_BTKD.square().mean(dim=-1)
+        zero = error_BTK.new_zeros(())
+        return SlotLoss(zero, zero, (weights_BTK * error_BTK).sum())
+    assert content_std_C is not None
+    predicted, target = SlotState.split(predicted_BTKD, layout), SlotState.split(target_BTKD, layout)
+    off = (predicted.position - target.position) / UNIT
+    position_BTK = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none").sum(dim=-1)
+    scale_BTK = ((predicted.scale / target.scale.clamp(min=1e-3)).log() / 0.1).square().sum(dim=-1)
+    # Where the parser lost a slot for a frame its size jumps: such frames must not drown the others.
+    scale_BTK = scale_BTK.clamp(max=25.0)
+    content_BTK = ((predicted.content - target.content) / content_std_C).square().mean(dim=-1)
+    return SlotLoss(
+        (weights_BTK * position_BTK).sum(), (weights_BTK * scale_BTK).sum(), (weights_BTK * content_BTK).sum()
+    )
+
+
+def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, ever: bool) -> Tensor:
+    """How much each slot of the frames 1..T-1 counts: `moving` where it moves, 1 where it stands still, 0 if
+    unused.
+
+    Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
+
+    Args:
+        slots_BTKD: the true slots of T frames.
+        ever: weigh a slot that moves anywhere in these frames alike in all of them. For rollouts, where a
+            slot that has come to rest in the wrong place is still wrong.
+
+    Returns:
+        (B, T - 1, K).
+    """
+    if not layout.explicit:
+        return slots_BTKD.new_ones(slots_BTKD[:, 1:, :, 0].shape)
+    state = SlotState.split(slots_BTKD, layout)
+    moves_BTK = (state.position[:, 1:] - state.position[:, :-1]).norm(dim=-1) > MOVES
+    if ever:
+        moves_BTK = moves_BTK.any(dim=1, keepdim=True).expand_as(moves_BTK)
+    present_BTK = state.presence[:, 1:, :, 0] >= 0.5
+    return present_BTK * (1.0 + (moving - 1.0) * moves_BTK)

@@ -1,0 +1,363 @@
+"""What all stages of training share: their settings, and a run that takes updates on one process or on many.
+
+A run's folder holds `state/` (everything needed to continue exactly: weights, optimiser, schedule, random numbers and
+the number of the next step), `logs/` (TensorBoard) and whatever the stage writes for people and for the next stage.
+
+Whatever is random in an update is a function of (seed, step) alone, and every process knows the whole batch's: each
+computes its rows of it, in as many parts as its memory needs, and the losses of all parts add up to that of the batch.
+So a run is the same run on one process or on many, in one part or in many, stopped and continued or not.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import KW_ONLY, dataclass
+from datetime import timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from accelerate import (
+    Accelerator,
+    DataLoaderConfiguration,
+    DistributedDataParallelKwargs,
+    InitProcessGroupKwargs,
+)
+from accelerate.state import AcceleratorState
+from torch import Tensor, nn
+from tqdm import tqdm
+from transformers import get_cosine_schedule_with_warmup
+
+from textocvp.data.episodes import EpisodeFile
+
+STEP_FILE = "step.json"
+LOG_EVERY = 20  # updates
+PATIENCE = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
+
+
+class SettingsError(ValueError):
+    """Settings that exclude each other or that this machine cannot do; the message says which."""
+
+
+@contextmanager
+def allowed_settings() -> Iterator[None]:
+    """For building a model: parts that do not fit each other are the settings' fault.
+
+    Raises:
+        SettingsError: for a ValueError that is no more special than that.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if type(error) is not ValueError:
+            raise
+        raise SettingsError(str(error)) from error
+
+
+def check_frame_size(image_size: int, setting: str, *sources: EpisodeFile) -> None:
+    """Check that a model reads frames of the size that episodes have.
+
+    Args:
+        image_size: side of the frames that it reads, in pixels.
+        setting: what that is called in its configuration.
+
+    Raises:
+        SettingsError: if a file has frames of another size.
+    """
+    for source in sources:
+        if source.image_size != image_size:
+            raise SettingsError(
+                f"{source.path} has frames of {source.image_size} pixels, {setting} is {image_size}: "
+                "collect the episodes at that size, or set it"
+            )
+
+
+@dataclass
+class TrainingSettings:
+    """What every stage of training can be told; each has its own defaults."""
+
+    data: Path
+    """Training episodes, from `python -m envs.collect --split train`."""
+    val: Path
+    """Held-out episodes, for the figures."""
+    out: Path
+    """Folder of the run. If it holds an unfinished run, that run goes on."""
+    _: KW_ONLY
+    episodes: int | None = None
+    """Train on the first so many episodes of the file only."""
+    set: tuple[str, ...] = ()
+    """Settings of the preset to change, each part.field=value: `--set predictor.layers=2`."""
+    steps: int = 1000
+    """Updates."""
+    batch: int = 16
+    """Samples an update, shared out among the processes."""
+    accumulate: int = 1
+    """Parts in which a process computes its share of a batch, one after the other: more need less memory."""
+    learning_rate: float = 4e-4
+    """Peak of the cosine schedule."""
+    warmup: int = 100
+    """Updates until the peak."""
+    clip_norm: float = 1.0
+    """Largest gradient norm."""
+    precision: Literal["no", "bf16", "fp16"] = "no"
+    """Mixed precision; fp16 needs a GPU."""
+    seed: int = 0
+    """Seed of weights and data order."""
+    evaluate_every: int = 500
+    """Updates between figures."""
+    evaluate_episodes: int = 40
+    """Held-out episodes they are measured on; the final figures use all."""
+    save_minutes: float = 4.0
+    """Minutes between saved states."""
+
+
+def start(out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: bool = False) -> Accelerator:
+    """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
+
+    Makes the folder, so that an unwritable one fails before any work.
+
+    Args:
+        some_unused: some parameters of what is trained take no part in an update.
+
+    Raises:
+        SettingsError: if the machine has no GPU for `fp16`.
+    """
+    if precision == "fp16" and not torch.cuda.is_available():
+        raise SettingsError("precision fp16 needs a GPU, and there is none here: use bf16 or no")
+    (out / "logs").mkdir(parents=True, exist_ok=True)
+    torch.set_flush_denormal(True)  # decaying Adam moments reach denormals, which are slow on CPUs
+    # Without this, several processes without a GPU would each believe to be alone.
+    only_cpus = int(os.environ.get("WORLD_SIZE", 1)) > 1 and not torch.cuda.is_available()
+    accelerator = Accelerator(
+        mixed_precision=precision,
+        log_with="tensorboard",
+        project_dir=str(out / "logs"),
+        cpu=only_cpus,
+        # The batch is shared out, not multiplied: the schedule takes one step an update on any number of processes.
+        dataloader_config=DataLoaderConfiguration(split_batches=True),
+        kwargs_handlers=[
+            InitProcessGroupKwargs(timeout=PATIENCE),
+            DistributedDataParallelKwargs(find_unused_parameters=some_unused),
+        ],
+    )
+    if accelerator.num_processes > 1:
+        atexit.register(_part)
+    accelerator.init_trackers("training")
+    return accelerator
+
+
+def _part() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+
+
+def finish(accelerator: Accelerator) -> None:
+    """Close the log when all processes are done; another run may `start` afterwards, also in another precision."""
+    accelerator.wait_for_everyone()
+    # Not `end_training`, which parts the processes: they could not meet again for the next run of a study.
+    for tracker in accelerator.trackers:
+        tracker.finish()
+    AcceleratorState._reset_state()
+
+
+def step_rng(seed: int, step: int) -> np.random.Generator:
+    """The generator of everything that is random in one step, the same on all processes."""
+    return np.random.default_rng([seed, step])
+
+
+class Run:
+    """A run from wherever `args.out` says it stopped: Adam, a cosine schedule with warm-up, clipped gradients.
+
+    A training loop is
+
+        for step in run.steps("predictor"):
+            rows = ...                                  # draw the whole batch, keep the rows `run.rows`
+            for part in run.parts():
+                run.backward(...)                       # what the rows `part` of these add to the loss of the batch
+            run.update(step)
+
+    Args:
+        args: the stage's settings.
+        accelerator: from `start`.
+        module: what is trained. Gradients of several processes meet only if the loss comes from calling `run.module`.
+
+    Attributes:
+        module: call this one.
+        first: number of the first step that is left to do.
+        rows: the rows of every batch that this process computes.
+
+    Raises:
+        SettingsError: if a batch has fewer rows than there are parts to compute.
+    """
+
+    def __init__(self, args: TrainingSettings, accelerator: Accelerator, module: nn.Module) -> None:
+        parts = accelerator.num_processes * args.accumulate
+        if args.accumulate < 1 or args.batch < parts:
+            raise SettingsError(
+                f"a batch of {args.batch} cannot be shared out among {accelerator.num_processes} processes x "
+                f"{args.accumulate} parts: accumulate must be at least 1, and batch at least {parts}"
+            )
+        self.args, self.accelerator = args, accelerator
+        edges = [args.batch * part // parts for part in range(parts + 1)]
+        mine = edges[accelerator.process_index * args.accumulate :][: args.accumulate + 1]
+        self.rows = slice(mine[0], mine[-1])
+        self._parts = [slice(a - mine[0], b - mine[0]) for a, b in pairwise(mine)]
+        learned = [parameter for parameter in module.parameters() if parameter.requires_grad]
+        optimizer = torch.optim.Adam(learned, lr=args.learning_rate)
+        schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)
+        self.module, self._optimizer, self._schedule = accelerator.prepare(module, optimizer, schedule)
+        self._figures: dict[str, Tensor] = {}
+        self._bar: Any = None
+        # Whether to stop is agreed upon between CPUs: asking the GPUs would make them wait for it at every step.
+        # `Any`: what `new_group` says it returns differs between versions of torch.
+        self._agreement: Any = None
+        if accelerator.num_processes > 1:
+            self._agreement = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
+        self.first = load_state(accelerator, args.out)
+
+    @property
+    def device(self) -> torch.device:
+        """Where this process computes."""
+        return self.accelerator.device
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this process is the one that measures, draws and writes."""
+        return self.accelerator.is_main_process
+
+    def steps(self, name: str) -> Iterator[int]:
+        """The numbers of the steps that are left. Saves the state when it is time to, and at the end.
+
+        On SIGTERM the step is finished, the state saved and the program left with status 143.
+
+        Args:
+            name: of the progress bar.
+        """
+        left = range(self.first, self.args.steps)
+        settings = dict(initial=self.first, total=self.args.steps, desc=name, unit="step")
+        self._bar = tqdm(left, disable=not self.is_main, **settings)
+        saved = time.monotonic()
+        with _termination() as asked:
+            for step in self._bar:
+                yield step
+                due = time.monotonic() - saved > 60 * self.args.save_minutes
+                due, stop = self._anywhere(due, bool(asked))
+                if due or stop:
+                    save_state(self.accelerator, self.args.out, step + 1)
+                    saved = time.monotonic()
+                if stop:
+                    raise SystemExit(128 + signal.SIGTERM)
+        save_state(self.accelerator, self.args.out, self.args.steps)
+
+    def parts(self) -> Iterator[slice]:
+        """The parts of this process's rows, counted from its first; each wants one `backward`."""
+        for number, part in enumerate(self._parts):
+            last = number + 1 == len(self._parts)
+            # Gradients travel between processes once an update.
+            with nullcontext() if last else self.accelerator.no_sync(self.module):
+                yield part
+
+    def share(self, part: slice) -> float:
+        """How much of a batch the rows of `part` are: what a mean over them counts in that over the batch."""
+        return (part.stop - part.start) / self.args.batch
+
+    def backward(self, loss: Tensor, figures: Mapping[str, Tensor] | None = None) -> None:
+        """Add the gradients of one part.
+
+        Args:
+            loss: what the part adds to the loss of the batch.
+            figures: for the log; like the loss they add up over the parts.
+        """
+        # Gradients are averaged over the processes; they are meant to add up.
+        self.accelerator.backward(loss * self.accelerator.num_processes)
+        for name, figure in {"loss/total": loss, **(figures or {})}.items():
+            self._figures[name] = self._figures.get(name, 0.0) + figure.detach()
+
+    def update(self, step: int, figures: Mapping[str, float] | None = None) -> None:
+        """Take the step that the gradients of all parts ask for, and log now and then.
+
+        Args:
+            figures: more for the log, which all processes agree on.
+        """
+        norm = self.accelerator.clip_grad_norm_(self.module.parameters(), self.args.clip_norm)
+        self._optimizer.step()
+        self._schedule.step()
+        self._optimizer.zero_grad()
+        if step % LOG_EVERY == 0:
+            sums = self.accelerator.reduce(self._figures, "sum")
+            values = {name: float(value) for name, value in sums.items()}
+            self.log(step, {**values, "gradient_norm": float(norm), **(figures or {})})
+            self._bar.set_postfix(
+                {name.removeprefix("loss/"): f"{value:.4f}" for name, value in values.items()}
+            )
+        self._figures = {}
+
+    def log(self, step: int, figures: Mapping[str, float]) -> None:
+        """Log figures of a step; only the main process's count."""
+        self.accelerator.log(dict(figures), step=step)
+
+    def total(self, amount: Tensor) -> Tensor:
+        """The sum over all processes of a tensor that needs no gradient: what a weighted loss is divided by."""
+        return self.accelerator.reduce(amount.detach(), "sum")
+
+    def _anywhere(self, *answers: bool) -> tuple[bool, ...]:
+        """Each answer, whether any process gave it: clocks differ and signals do not reach all."""
+        if self._agreement is None:
+            return answers
+        said = torch.tensor(answers, dtype=torch.int32)
+        torch.distributed.all_reduce(said, torch.distributed.ReduceOp.MAX, group=self._agreement)
+        return tuple(bool(answer) for answer in said)
+
+
+@contextmanager
+def _termination() -> Iterator[list[int]]:
+    """Collects SIGTERM instead of dying of it. Only the main thread may: elsewhere nothing changes."""
+    asked: list[int] = []
+    try:
+        before = signal.signal(signal.SIGTERM, lambda number, frame: asked.append(number))
+    except ValueError:
+        yield asked
+        return
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def save_state(accelerator: Accelerator, out: Path, next_step: int) -> None:
+    """Replace `out`/state by the present state; killed at any moment, the old or the new state is there whole."""
+    new, state, old = out / "state.new", out / "state", out / "state.old"
+    if accelerator.is_main_process:
+        shutil.rmtree(new, ignore_errors=True)
+    accelerator.wait_for_everyone()
+    accelerator.save_state(str(new))
+    accelerator.wait_for_everyone()
+    if accelerator.is_main_process:
+        (new / STEP_FILE).write_text(json.dumps({"next_step": next_step}))
+        shutil.rmtree(old, ignore_errors=True)
+        if state.exists():
+            state.rename(old)
+        new.rename(state)
+        shutil.rmtree(old, ignore_errors=True)
+    accelerator.wait_for_everyone()
+
+
+def load_state(accelerator: Accelerator, out: Path) -> int:
+    """Continue from `out`/state if there is one; the number of the next step, 0 for a new run."""
+    state = out / "state"
+    if accelerator.is_main_process and not state.exists() and (out / "state.old").exists():
+        (out / "state.old").rename(state)  # killed between the two renames of save_state
+    accelerator.wait_for_everyone()
+    if not state.exists():
+        return 0
+    accelerator.load_state(str(state))
+    return int(json.loads((state / STEP_FILE).read_text())["next_step"])
