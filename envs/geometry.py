@@ -92,6 +92,3 @@ class Sizes:
     def footprint(self, kind: str) -> float:
         """Radius in metres of the smallest upright cylinder around an object."""
         return self.bowl_radius if kind == "bowl" else self.block * 0.5**0.5
-
-    def height(self, kind: str) -> float:
-        return self.bowl_height if kind == "bowl" else self.block

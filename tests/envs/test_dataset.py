@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -12,12 +15,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from envs import collection
+from envs import dataset
 from envs.collect import Args
-from envs.collection import collect
-from envs.episode import EpisodeConfig, record_episode
+from envs.dataset import EpisodeConfig, collect, record_episode
 from envs.splits import SPLITS
-from textocvp.episodes import EpisodeFile
+from envs.tabletop import TabletopEnv
+from envs.tasks import TASKS
 
 ROOT = Path(__file__).parents[2]
 # Small enough for CI: 16x16 pixels at 8 frames a second, in pieces of 3 episodes.
@@ -25,18 +28,17 @@ SMALL = EpisodeConfig("val", image_size=16, render_stride=24)
 RUN = """
 import sys
 from pathlib import Path
-from envs import collection
-from envs.episode import EpisodeConfig
-collection.EPISODES_PER_PIECE, collection.EPISODES_PER_MERGE = 3, 6
-config = EpisodeConfig("val", image_size=16, render_stride=24)
-collection.collect(config, 14, Path(sys.argv[1]), workers=1)
+from envs import dataset
+dataset.EPISODES_PER_PIECE, dataset.EPISODES_PER_MERGE = 3, 6
+config = dataset.EpisodeConfig("val", image_size=16, render_stride=24)
+dataset.collect(config, 14, Path(sys.argv[1]), workers=1)
 """
 
 
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collection, "EPISODES_PER_PIECE", 3)
-    monkeypatch.setattr(collection, "EPISODES_PER_MERGE", 6)
+    monkeypatch.setattr(dataset, "EPISODES_PER_PIECE", 3)
+    monkeypatch.setattr(dataset, "EPISODES_PER_MERGE", 6)
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -62,29 +64,62 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_file_holds_what_the_episodes_were(whole: Path) -> None:
+@pytest.fixture(scope="module")
+def env() -> Iterator[TabletopEnv]:
     env = SMALL.make()
-    with EpisodeFile(whole) as file, h5py.File(whole) as raw:
-        assert len(file) == 14 and file.split == "val"
-        assert file.seeds.tolist() == [SPLITS["val"].seed(number) for number in range(14)]
-        recorded = record_episode(env, SMALL, 5)
-        episode = file.episode(5)
-        assert np.array_equal(episode.frames, recorded.frames)
-        assert np.array_equal(episode.segmentation, recorded.segmentation)
-        assert episode.instruction == recorded.instruction and episode.target == recorded.target
-        assert tuple((item.kind, item.color) for item in episode.objects) == recorded.objects
-        assert episode.success == recorded.success and file.success.mean() > 0.9
-        start, length = raw["episode/start"][5], raw["episode/length"][5]
-        span, count = slice(start, start + length), len(recorded.objects)
-        assert np.array_equal(raw["arm"][span], recorded.arm)
-        assert np.array_equal(raw["gripper"][span], recorded.gripper)
-        assert np.array_equal(raw["object_position"][span, :count], recorded.position)
-        assert np.isnan(raw["object_orientation"][span, count:]).all()
-        _, info = env.reset(seed=0)
-        assert np.allclose(file.attribute("camera_intrinsics"), info["camera"]["intrinsics"])
-        assert np.allclose(file.attribute("camera_extrinsics"), info["camera"]["extrinsics"])
-        assert '"pybullet"' in file.attribute("versions")
+    yield env
     env.close()
+
+
+def test_the_file_holds_what_the_episodes_were(whole: Path, env: TabletopEnv) -> None:
+    recorded = record_episode(env, SMALL, 5)
+    with h5py.File(whole) as file:
+        index = file["episode"]
+        assert file.attrs["split"] == "val" and file.attrs["first_seed"] == SPLITS["val"].first_seed
+        assert index["seed"][:].tolist() == [SPLITS["val"].seed(number) for number in range(14)]
+        assert index["start"][:].tolist() == [0, *np.cumsum(index["length"])[:-1]]
+        assert file["frames"].shape == (index["length"][:].sum(), 16, 16, 3)
+        assert index["instruction"].asstr()[5] == recorded.instruction
+        assert index["success"][5] == recorded.success and index["success"][:].mean() > 0.9
+        start, length = index["start"][5], index["length"][5]
+        span, count = slice(start, start + length), len(recorded.objects)
+        for name in ("frames", "segmentation", "arm", "gripper"):
+            assert np.array_equal(file[name][span], recorded.arrays[name]), name
+        for name in ("object_position", "object_orientation"):
+            assert np.array_equal(file[name][span, :count], recorded.arrays[name]), name
+            assert np.isnan(file[name][span, count:]).all()
+        _, info = env.reset(seed=0)
+        assert np.allclose(file.attrs["camera_intrinsics"], info["camera"]["intrinsics"])
+        assert np.allclose(file.attrs["camera_extrinsics"], info["camera"]["extrinsics"])
+        assert '"pybullet"' in file.attrs["versions"]
+
+
+def test_the_file_says_what_its_labels_words_and_questions_are(whole: Path, env: TabletopEnv) -> None:
+    """Format version 2: a reader needs to know no task."""
+    with h5py.File(whole) as file:
+        assert (file.attrs["format"], file.attrs["format_version"]) == ("textocvp-episodes", 2)
+        assert "target" not in file["episode"]
+        labels = json.loads(file.attrs["labels"])
+        vocabulary = json.loads(file.attrs["vocabulary"])
+        assert labels == {"background": 0, "robot": 1}
+        assert vocabulary == list(TASKS["put_block_in_bowl"].vocabulary)
+        for number in range(14):
+            seed = int(file["episode/seed"][number])
+            _, info = env.reset(seed=seed, options=SPLITS["val"].options(seed))
+            objects = json.loads(file["episode/objects"].asstr()[number])
+            assert objects == [
+                {name: item[name] for name in ("id", "label", "kind", "color")} for item in info["objects"]
+            ]
+            known = {*labels.values(), *(item["label"] for item in objects)}
+            first = file["segmentation"][file["episode/start"][number]]
+            assert set(np.unique(first)) <= known and len(known) == len(objects) + 2
+            questions = json.loads(file["episode/questions"].asstr()[number])
+            played = [q for q in questions if q["text"] == file["episode/instruction"].asstr()[number]]
+            assert [(q["moves"], q["ends_at"]) for q in played] == [tuple(info["target"][0])]
+            words = {word for question in questions for word in question["text"].split()}
+            assert words <= set(vocabulary)
+            kinds = [item["kind"] for item in objects]
+            assert len(questions) == kinds.count("block") * kinds.count("bowl")
 
 
 def test_two_workers_write_the_same_file(whole: Path, tmp_path: Path) -> None:
@@ -127,9 +162,10 @@ def test_killed_again_and_again_it_loses_and_doubles_nothing(whole: Path, tmp_pa
             kills += 1
         code = process.wait()
         if path.exists():
-            with EpisodeFile(path) as file:  # opens, and is consistent, whenever the kill came
-                assert file.seeds.tolist() == [SPLITS["val"].seed(number) for number in range(len(file))]
-                assert len(file.episode(-1).frames) == file.lengths[-1]
+            with h5py.File(path) as file:  # opens, and is consistent, whenever the kill came
+                seeds = file["episode/seed"][:].tolist()
+                assert seeds == [SPLITS["val"].seed(number) for number in range(len(seeds))]
+                assert len(file["frames"][:]) == file["episode/length"][:].sum()
         if code == 0:
             break
     assert code == 0 and kills >= 3
@@ -154,6 +190,14 @@ def test_another_configuration_is_refused(whole: Path, tmp_path: Path) -> None:
         collect(SMALL, 2, tmp_path / "other.h5")
 
 
+def test_a_file_of_version_1_is_not_appended_to(whole: Path, tmp_path: Path) -> None:
+    old = shutil.copy(whole, tmp_path / "old.h5")
+    with h5py.File(old, "a") as file:
+        file.attrs["format_version"] = 1
+    with pytest.raises(ValueError, match="has format version 1, and version 2 cannot be appended"):
+        collect(SMALL, 20, old)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"), [({"episodes": 0}, "1 to 10000000"), ({"workers": 0}, "at least 1")]
 )
@@ -169,8 +213,8 @@ def test_the_command_line_collects_and_previews(tmp_path: Path) -> None:
 
     out = tmp_path / "test.h5"
     assert "2 episodes of split test" in run("--episodes", "2", "--out", str(out))
-    with EpisodeFile(out) as file:
-        assert len(file) == 2 and file.image_size == 32
+    with h5py.File(out) as file:
+        assert len(file["episode/seed"]) == 2 and file["frames"].shape[1:] == (32, 32, 3)
     run("--preview", "--episodes", "2", "--out", str(tmp_path / "sheet.png"))
     sheet = iio.imread(tmp_path / "sheet.png")
     assert sheet.shape == (2 * 132, 9 * 132, 3)
