@@ -22,9 +22,8 @@ import pybullet as p
 import tyro
 
 import envs
-from envs.collection import collect
-from envs.episode import EpisodeConfig
-from textocvp.episodes import EpisodeFile
+from envs.dataset import EpisodeConfig, collect
+from textocvp.data.episodes import EpisodeFile
 
 LINKS = 7
 TRIANGLES = 16_000

@@ -122,6 +122,30 @@ def test_the_file_says_what_its_labels_words_and_questions_are(whole: Path, env:
             assert len(questions) == kinds.count("block") * kinds.count("bowl")
 
 
+def test_the_page_names_every_field(whole: Path) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    fields = [name for name in contents(whole) if name != "episode"]
+    assert len(fields) == 13 + 10
+    for name in fields:
+        assert f"| `{name.removeprefix('@')}` |" in page, name
+
+
+def test_the_example_of_the_page_writes_what_is_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python\n")[1].split("```")[0], {})
+    needed = {
+        line.split("`")[1] for line in page.splitlines() if line.startswith("| `") and "| yes |" in line
+    }
+    assert {name.removeprefix("@") for name in contents(tmp_path / "own.h5")} == {*needed, "episode"}
+    with h5py.File("own.h5") as file:
+        assert len(file["frames"]) == file["episode/length"][:].sum() == 51
+        assert file["episode/start"][:].tolist() == [0, 20]
+        assert file["episode/instruction"].asstr()[1] == "put the green block in the gray bowl"
+
+
 def test_two_workers_write_the_same_file(whole: Path, tmp_path: Path) -> None:
     collect(SMALL, 14, tmp_path / "two.h5", workers=2)
     assert contents(tmp_path / "two.h5") == contents(whole)
