@@ -144,7 +144,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.observation_space = observation_space(
             image_size, self.camera.preset.far, self.task.longest_sentence, self.extras
         )
-        self.world = Tabletop(self.camera, Sizes(object_scale), physics_hz, gui=render_mode == "human")
+        self.world = Tabletop(
+            self.camera, Sizes().scaled(object_scale), physics_hz, gui=render_mode == "human"
+        )
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.world, self.robot)
         self._scene: Scene | None = None
@@ -245,7 +247,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         return observation
 
     def _info(self) -> dict[str, Any]:
-        world, goal, gripper = self.world, self.scene.goal, self.robot.state()
+        world, goal, grip = self.world, self.scene.goal, self.robot.state()
         info: dict[str, Any] = {
             "is_success": all(self._fulfilled()),
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
@@ -255,11 +257,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "segmentation": self._recorder.images[-1].segmentation.copy(),
             "palette": palette(),
             "camera": {"intrinsics": self.camera.intrinsics, "extrinsics": self.camera.extrinsics},
-            "gripper": {
-                "position": np.array(gripper.position),
-                "yaw": gripper.yaw,
-                "holding": gripper.holding,
-            },
+            "gripper": {"position": np.array(grip.position), "yaw": grip.yaw, "holding": grip.holding},
             "sim_step": world.steps,
         }
         if self.record_frames:
@@ -270,14 +268,6 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         infos = []
         for index, item in enumerate(self.scene.objects):
             position, orientation = map(np.array, self.world.pose(index))
-            infos.append(
-                {
-                    "id": index,
-                    "label": FIRST_OBJECT + index,
-                    "kind": item.kind,
-                    "color": item.color,
-                    "position": position,
-                    "orientation": orientation,
-                }
-            )
+            named = {"id": index, "label": FIRST_OBJECT + index, "kind": item.kind, "color": item.color}
+            infos.append(named | {"position": position, "orientation": orientation})
         return infos

@@ -12,7 +12,7 @@ from gymnasium import logger
 from numpy.typing import NDArray
 
 from envs.colors import COLORS, FLOOR_RGB, TABLE_RGB
-from envs.geometry import TABLE, Sizes
+from envs.geometry import BLOCK_MASS, BOWL_MASS, TABLE, Sizes
 from envs.physics.arm import Joints, arm_urdf
 from envs.physics.camera import Camera
 from envs.physics.shapes import bowl_contact_file, bowl_mesh
@@ -172,7 +172,7 @@ class Tabletop:
                 look = p.createVisualShape(
                     p.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client
                 )
-                touch, mass, z = block_touch, sizes.block_mass, floor + sizes.block / 2
+                touch, mass, z = block_touch, BLOCK_MASS, floor + sizes.block / 2
             else:
                 look = p.createVisualShape(
                     p.GEOM_MESH,
@@ -182,7 +182,7 @@ class Tabletop:
                     rgbaColor=rgba,
                     physicsClientId=client,
                 )
-                touch, mass, z = bowl_touch, sizes.bowl_mass, 0.0
+                touch, mass, z = bowl_touch, BOWL_MASS, 0.0
             turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])
             body = p.createMultiBody(mass, touch, look, [item.x, item.y, z], turn, physicsClientId=client)
             p.changeDynamics(body, -1, lateralFriction=1.0, physicsClientId=client)
