@@ -22,8 +22,7 @@ import pybullet as p
 import tyro
 
 import envs
-from envs.collection import collect
-from envs.episode import EpisodeConfig
+from envs.dataset import EpisodeConfig, collect
 from textocvp.data.episodes import EpisodeFile
 
 LINKS = 7

@@ -1,4 +1,4 @@
-"""Tabletop environments: a robot arm puts blocks into bowls, told by a sentence.
+"""Tabletop environments: a robot arm does what a sentence asks.
 
 Importing this package registers ``PutBlockInBowl-v0`` and ``PutBlocksInBowls-v0`` with Gymnasium; without an
 import, ``gymnasium.make("envs:PutBlockInBowl-v0")`` does the same.
@@ -7,18 +7,14 @@ import, ``gymnasium.make("envs:PutBlockInBowl-v0")`` does the same.
 from gymnasium.envs.registration import register
 
 from envs.expert import Expert
-from envs.language import ColorPair, format_instruction, parse_instruction
-from envs.tabletop import PutBlockInBowl, PutBlocksInBowls
+from envs.tabletop import TabletopEnv
+from envs.tasks import TASKS
 
 # The environments truncate by themselves, because their limits depend on the control mode.
-register(id="PutBlockInBowl-v0", entry_point="envs.tabletop:PutBlockInBowl")
-register(id="PutBlocksInBowls-v0", entry_point="envs.tabletop:PutBlocksInBowls")
+for env_id, task in (
+    ("PutBlockInBowl-v0", "put_block_in_bowl"),
+    ("PutBlocksInBowls-v0", "put_blocks_in_bowls"),
+):
+    register(id=env_id, entry_point="envs.tabletop:TabletopEnv", kwargs={"task": task})
 
-__all__ = [
-    "ColorPair",
-    "Expert",
-    "PutBlockInBowl",
-    "PutBlocksInBowls",
-    "format_instruction",
-    "parse_instruction",
-]
+__all__ = ["TASKS", "Expert", "TabletopEnv"]

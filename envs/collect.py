@@ -1,30 +1,43 @@
-"""Collect expert episodes into an HDF5 file: ``python -m envs.collect --split train --episodes 10000 --out
-F``.
+"""Collect expert episodes into an HDF5 file: ``python -m envs.collect --split train --episodes 10000 --out F``.
 
 The file is the same for any number of workers. A run that was killed, at whatever moment, is resumed by
-giving the same command again; a finished one is left as it is.
+giving the same command again; a finished one is left as it is. docs/data.md describes the file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING
 
+import imageio.v3 as iio
+import numpy as np
 import tyro
+from numpy.typing import NDArray
 
-from envs.collection import collect
-from envs.episode import EpisodeConfig
-from envs.preview import save_contact_sheet
-from envs.splits import SEEDS_PER_SPLIT
-from envs.storage import episode_count
+from envs.dataset import EpisodeConfig, collect, episode_count, record_episode
+from envs.physics.camera import PRESETS
+from envs.splits import SEEDS_PER_SPLIT, SPLITS
+
+if TYPE_CHECKING:
+    SplitName = str
+    CameraName = str
+else:
+    SplitName = tyro.extras.literal_type_from_choices(SPLITS)
+    CameraName = tyro.extras.literal_type_from_choices(PRESETS)
+
+COLUMNS = 9
+"""Frames of an episode on a contact sheet."""
+
+PIXELS = 128
+GAP = 4
 
 
 @dataclass(frozen=True)
 class Args:
     """Collect expert episodes into an HDF5 file, or show what they look like."""
 
-    split: Literal["train", "val", "test", "unseen_colors", "more_objects", "controllability"] = "train"
+    split: SplitName = "train"
     """Which scenes; the splits' seeds are disjoint."""
     episodes: int = 100
     """How many episodes the file shall have."""
@@ -34,7 +47,7 @@ class Args:
     """The file to write. Default: data/tabletop-SPLIT.h5, or preview-SPLIT.png."""
     image_size: int = 64
     """Height and width in pixels."""
-    camera: Literal["close", "paper"] = "close"
+    camera: CameraName = "close"
     """Camera preset."""
     preview: bool = False
     """Write a contact sheet PNG of the first episodes instead."""
@@ -57,6 +70,26 @@ def main(args: Args) -> None:
         out = args.out or Path(f"data/tabletop-{args.split}.h5")
         collect(config, args.episodes, out, args.workers)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
+
+
+def save_contact_sheet(config: EpisodeConfig, episodes: int, out: Path) -> None:
+    """Write a PNG with one row for each episode: frames evenly spread from the first to the last."""
+    env = config.make()
+    try:
+        rows = [_contact_row(record_episode(env, config, i).arrays["frames"]) for i in range(episodes)]
+    finally:
+        env.close()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(out, np.concatenate(rows))
+
+
+def _contact_row(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """`COLUMNS` frames of (T, H, W, 3) beside each other with a gap; small ones enlarged."""
+    chosen = frames[np.linspace(0, len(frames) - 1, COLUMNS).round().astype(int)]
+    factor = max(1, PIXELS // frames.shape[1])
+    large = chosen.repeat(factor, axis=1).repeat(factor, axis=2)
+    spaced = np.pad(large, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=255)
+    return np.concatenate(list(spaced), axis=1)
 
 
 if __name__ == "__main__":

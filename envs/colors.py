@@ -1,8 +1,8 @@
-"""The colours of the tabletop: what objects may look like, and what captions may say."""
+"""The colours of the tabletop: how things look, and which colours captions may name."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 RGB = tuple[int, int, int]
 ColorSplit = Literal["seen", "unseen", "all"]
@@ -31,7 +31,7 @@ UNSEEN: tuple[str, ...] = ("blue", "green", "red", "pink", "purple", "white", "o
 CAPTION_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "unseen": UNSEEN, "all": tuple(COLORS)}
 """Colour split -> the colours its captions may name. Distractors may have any colour."""
 
-ARM_RGB: RGB = (105, 72, 240)
+ROBOT_RGB: RGB = (105, 72, 240)
 """The one colour of every link and of the gripper.
 
 A robot knows how it looks, so the arm may carry a hue that no object has: then "this pixel is my arm" never
@@ -42,8 +42,6 @@ TABLE_RGB: RGB = (47, 47, 47)
 FLOOR_RGB: RGB = (239, 239, 239)
 
 
-def chroma(rgb: RGB) -> tuple[float, float, float]:
-    """Brightness-free colour ``(rgb - L) / (L + 0.2)``, with ``L`` the mean of ``rgb`` scaled to 0..1."""
-    r, g, b = (value / 255 for value in rgb)
-    light = (r + g + b) / 3
-    return (r - light) / (light + 0.2), (g - light) / (light + 0.2), (b - light) / (light + 0.2)
+def palette() -> dict[str, Any]:
+    """How things look, RGB in 0..255: `colors` (name -> colour of an object), `robot` and `table`."""
+    return {"colors": dict(COLORS), "robot": ROBOT_RGB, "table": TABLE_RGB}

@@ -5,7 +5,7 @@ World frame: metres, z up, the table top is z = 0, the robot stands at the origi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
@@ -37,61 +37,36 @@ TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))
 """The table top."""
 
 
+BLOCK_MASS, BOWL_MASS = 0.02, 0.2
+"""In kilograms, at any size."""
+
+
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the objects in metres and kilograms, after scaling.
+    """Sizes of the objects in metres.
 
-    At scale 1 they are those of the paper's published frames: 6 cm blocks and 14 cm bowls (CLIPort's own are
+    By default they are those of the paper's published frames: 6 cm blocks and 14 cm bowls (CLIPort's own are
     4 cm and 11.4 cm).
     """
 
-    scale: float = 1.0
+    block: float = 0.058
+    """Edge of a block."""
+    bowl_radius: float = 0.069
+    """Outer radius at the rim."""
+    bowl_inner_radius: float = 0.064
+    """Inner radius at the rim."""
+    bowl_floor_radius: float = 0.048
+    """Inner radius at the floor: wider than half a block's diagonal, so that a block can lie flat."""
+    bowl_foot_radius: float = 0.052
+    """Outer radius where the bowl stands on the table."""
+    bowl_height: float = 0.046
+    bowl_floor: float = 0.006
+    """Thickness of the floor."""
 
-    @property
-    def block(self) -> float:
-        """Edge of a block."""
-        return 0.058 * self.scale
-
-    @property
-    def block_mass(self) -> float:
-        return 0.02
-
-    @property
-    def bowl_mass(self) -> float:
-        return 0.2
-
-    @property
-    def bowl_radius(self) -> float:
-        """Outer radius at the rim."""
-        return 0.069 * self.scale
-
-    @property
-    def bowl_inner_radius(self) -> float:
-        """Inner radius at the rim."""
-        return 0.064 * self.scale
-
-    @property
-    def bowl_floor_radius(self) -> float:
-        """Inner radius at the floor: wider than half a block's diagonal, so that a block can lie flat."""
-        return 0.048 * self.scale
-
-    @property
-    def bowl_foot_radius(self) -> float:
-        """Outer radius where the bowl stands on the table."""
-        return 0.052 * self.scale
-
-    @property
-    def bowl_height(self) -> float:
-        return 0.046 * self.scale
-
-    @property
-    def bowl_floor(self) -> float:
-        """Thickness of the floor."""
-        return 0.006 * self.scale
+    def scaled(self, factor: float) -> Sizes:
+        """All of them times ``factor``."""
+        return Sizes(**{name: value * factor for name, value in asdict(self).items()})
 
     def footprint(self, kind: str) -> float:
         """Radius in metres of the smallest upright cylinder around an object."""
         return self.bowl_radius if kind == "bowl" else self.block * 0.5**0.5
-
-    def height(self, kind: str) -> float:
-        return self.bowl_height if kind == "bowl" else self.block

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from envs.arm import Joints, forward_kinematics
 from envs.colors import CAPTION_COLORS
 from envs.geometry import Sizes
-from envs.language import ColorPair, parse_instruction
-from envs.robot import HOME_JOINTS, REACH_HIGH, REACH_LOW
-from envs.sampling import SceneRequest, jitter_arm, sample_scene
-from envs.scene import ObjectSpec, Scene, find_goal, read_layout
+from envs.physics.arm import Joints, forward_kinematics
+from envs.physics.robot import HOME_JOINTS, REACH_HIGH, REACH_LOW
+from envs.sampling import SceneRequest, arm_jitter
+from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, read_layout
+from envs.tasks.base import Task
 
 RANDOM_SCENE_OPTIONS = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
 OPTIONS = ("layout", "instruction", "arm_start", *RANDOM_SCENE_OPTIONS)
@@ -24,27 +24,31 @@ OPTIONS = ("layout", "instruction", "arm_start", *RANDOM_SCENE_OPTIONS)
 class ResetOptions:
     """A checked `options` argument. `request` describes the random scene where `layout` is None."""
 
+    task: Task
     layout: tuple[ObjectSpec, ...] | None
-    wishes: tuple[ColorPair, ...] | None
+    goal: tuple[GoalPair, ...] | None
+    """What the instruction asks for, where layout and instruction are both given."""
     arm_start: str | Joints
     request: SceneRequest
-    goal: tuple[tuple[int, int], ...] | None
-    """(block id, bowl id) pairs, where layout and instruction are both given."""
 
     def draw(self, rng: np.random.Generator, sizes: Sizes) -> tuple[Scene, Joints]:
         """The scene to build, and the joint angles the arm starts at."""
-        if self.layout is None:
-            scene = sample_scene(rng, self.request, sizes)
+        task, layout, request = self.task, self.layout, self.request
+        if layout is None:
+            scene = task.sample(rng, request, sizes)
         else:
-            scene = Scene(self.layout, self.goal or _draw_goal(rng, self.layout, self.request))
-        if self.arm_start == "random":
-            scene = jitter_arm(rng, scene)
+            scene = task.scene(
+                layout, self.goal or task.draw_goal(rng, layout, request.color_split, request.n_pairs)
+            )
         start = HOME_JOINTS if isinstance(self.arm_start, str) else self.arm_start
-        joints = tuple(angle + offset for angle, offset in zip(start, scene.arm_offset, strict=True))
+        offsets = arm_jitter(rng) if self.arm_start == "random" else (0.0,) * 6
+        joints = tuple(angle + offset for angle, offset in zip(start, offsets, strict=True))
         return scene, joints  # type: ignore[return-value]
 
 
-def read_options(options: Mapping[str, Any] | None, defaults: SceneRequest, sizes: Sizes) -> ResetOptions:
+def read_options(
+    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, sizes: Sizes
+) -> ResetOptions:
     """Check `options`; what is not given comes from ``defaults``.
 
     Raises:
@@ -60,29 +64,35 @@ def read_options(options: Mapping[str, Any] | None, defaults: SceneRequest, size
             f"unknown reset option {', '.join(map(repr, unknown))}; allowed: {', '.join(OPTIONS)}"
         )
     layout = read_layout(options["layout"], sizes) if options.get("layout") is not None else None
-    wishes = parse_instruction(options["instruction"]) if options.get("instruction") is not None else None
+    steps = task.parse(options["instruction"]) if options.get("instruction") is not None else None
     if layout is not None:
         clash = [name for name in RANDOM_SCENE_OPTIONS if name in options and name != "color_split"]
         if clash:
             raise ValueError(f"{', '.join(clash)} describe a random scene and cannot be given with a layout")
-    request = _read_request(options, defaults, wishes, layout is not None)
+        there = {item.kind for item in layout}
+        missing = [kind for relation in task.relations for kind in relation.kinds if kind not in there]
+        if missing:
+            raise ValueError(f"a layout has at least one {missing[0]}")
+    request = _read_request(options, defaults, steps, layout is not None)
     goal = None
-    if layout is not None:
-        goal = find_goal(layout, wishes) if wishes is not None else None
-        if goal is None and not _possible_pairs(layout, request):
-            raise ValueError(
-                f"no instruction with colours {', '.join(CAPTION_COLORS[request.color_split])} "
-                f"has anything to do in this layout; give an 'instruction', or another 'color_split'"
-            )
-        if goal is not None and all(layout[block].inside == bowl for block, bowl in goal):
-            raise ValueError("the layout already fulfils the instruction; name another bowl")
-    if wishes is not None and len({wish.bowl for wish in wishes}) < len(wishes):
-        raise ValueError("an instruction must not name a bowl twice: a bowl has room for one block")
-    return ResetOptions(layout, wishes, _read_arm_start(options.get("arm_start", "home")), request, goal)
+    if layout is not None and steps is not None:
+        goal = task.find_goal(layout, steps)
+        if all(task.relation(pair).fulfilled_at_start(layout, pair.thing, pair.target) for pair in goal):
+            raise ValueError("the layout already fulfils the instruction; ask for something else")
+    elif layout is not None and not task.open_pairs(layout, request.color_split):
+        raise ValueError(
+            f"no instruction with colours {', '.join(CAPTION_COLORS[request.color_split])} "
+            f"has anything to do in this layout; give an 'instruction', or another 'color_split'"
+        )
+    task.check_instructions(steps or ())
+    return ResetOptions(task, layout, goal, _read_arm_start(options.get("arm_start", "home")), request)
 
 
 def _read_request(
-    options: Mapping[str, Any], defaults: SceneRequest, wishes: tuple[ColorPair, ...] | None, has_layout: bool
+    options: Mapping[str, Any],
+    defaults: SceneRequest,
+    steps: tuple[Instruction, ...] | None,
+    has_layout: bool,
 ) -> SceneRequest:
     split = options.get("color_split", defaults.color_split)
     if split not in CAPTION_COLORS:
@@ -98,39 +108,15 @@ def _read_request(
     given["target_in_bowl"] = options.get("target_in_bowl", defaults.target_in_bowl)
     if not isinstance(given["target_in_bowl"], bool | np.bool_):
         raise ValueError(f"target_in_bowl must be True or False, not {given['target_in_bowl']!r}")
-    if wishes is not None and not has_layout:
-        named = [color for wish in wishes for color in wish]
-        if len(set(named)) < len(named):
+    if steps is not None and not has_layout:
+        named = [thing for step in steps for thing in step.things]
+        if len({thing.color for thing in named}) < len(named):
             raise ValueError(
                 "no two objects of a random scene share a colour, so its instruction must not "
                 "name a colour twice"
             )
-        given |= {"wishes": wishes, "n_pairs": len(wishes)}
+        given |= {"instructions": steps, "named": tuple(thing.kind for thing in named)}
     return replace(defaults, **given)
-
-
-def _possible_pairs(layout: tuple[ObjectSpec, ...], request: SceneRequest) -> list[tuple[int, int]]:
-    """(block id, bowl id) pairs that are not fulfilled yet and may be named."""
-    colors = CAPTION_COLORS[request.color_split]
-    nameable = [index for index, item in enumerate(layout) if item.color in colors]
-    taken = {item.inside: index for index, item in enumerate(layout) if item.inside is not None}
-    return [
-        (block, bowl)
-        for block in nameable
-        for bowl in nameable
-        if layout[block].kind == "block" and layout[bowl].kind == "bowl" and bowl not in taken
-    ]
-
-
-def _draw_goal(
-    rng: np.random.Generator, layout: tuple[ObjectSpec, ...], request: SceneRequest
-) -> tuple[tuple[int, int], ...]:
-    goal: list[tuple[int, int]] = []
-    pairs = _possible_pairs(layout, request)
-    while pairs and len(goal) < request.n_pairs:
-        goal.append(pairs[int(rng.integers(len(pairs)))])
-        pairs = [pair for pair in pairs if pair[0] != goal[-1][0] and pair[1] != goal[-1][1]]
-    return tuple(goal)
 
 
 def _read_arm_start(value: Any) -> str | Joints:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import hypot, pi
 
 import numpy as np
 
-from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
+from envs.colors import COLORS, ColorSplit
 from envs.geometry import SPAWN, Sizes
-from envs.language import ColorPair
-from envs.scene import MAX_OBJECTS, ObjectSpec, Scene, find_goal
+from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
 MAX_TRIES = 5000
@@ -28,88 +28,95 @@ class SceneRequest:
         ValueError: from `__post_init__`, when no scene can be like that.
     """
 
+    named: tuple[str, ...]
+    """Kinds of the things that the instruction names, in its order: thing, target, thing, target, ..."""
     n_objects: int = 6
     n_bowls: int | None = None
     """Number of bowls; uniform over the possible numbers when None."""
     color_split: ColorSplit = "seen"
     """Which colours the instruction may name."""
-    n_pairs: int = 1
-    wishes: tuple[ColorPair, ...] | None = None
-    """The colours that the instruction names; drawn when None."""
+    instructions: tuple[Instruction, ...] | None = None
+    """What the instruction asks for; drawn when None."""
     blocks_in_bowls: int = 0
     """How many blocks that the instruction does not name start in bowls that it does not name."""
     target_in_bowl: bool = False
     """Whether the first named block starts in a bowl that is not named."""
 
     def __post_init__(self) -> None:
-        if not 2 * self.n_pairs <= self.n_objects <= MAX_OBJECTS:
+        if not len(self.named) <= self.n_objects <= MAX_OBJECTS:
             raise ValueError(
-                f"n_objects must be {2 * self.n_pairs} to {MAX_OBJECTS} for {self.n_pairs} (block, bowl) "
-                f"pairs, so that all fit on the table; got {self.n_objects}"
+                f"n_objects must be {len(self.named)} to {MAX_OBJECTS} for the {len(self.named)} things that "
+                f"the instruction names, so that all fit on the table; got {self.n_objects}"
             )
         low, high = self.bowl_range
         if low > high:
             raise ValueError(
-                f"{self.n_objects} objects are too few for {self.n_pairs} named pairs and "
+                f"{self.n_objects} objects are too few for {len(self.named)} named things and "
                 f"{self.blocks_in_bowls + self.target_in_bowl} blocks that start in other bowls"
             )
         if self.n_bowls is not None and not low <= self.n_bowls <= high:
             raise ValueError(f"n_bowls must be {low} to {high} for this scene; got {self.n_bowls}")
 
     @property
+    def n_pairs(self) -> int:
+        return len(self.named) // 2
+
+    @property
     def bowl_range(self) -> tuple[int, int]:
         """Fewest and most bowls such a scene can have."""
-        low = self.n_pairs + self.blocks_in_bowls + self.target_in_bowl
-        return low, min(MAX_BOWLS, self.n_objects - self.n_pairs - self.blocks_in_bowls)
+        low = self.named.count("bowl") + self.blocks_in_bowls + self.target_in_bowl
+        return low, min(MAX_BOWLS, self.n_objects - self.named.count("block") - self.blocks_in_bowls)
+
+    def draw_n_bowls(self, rng: np.random.Generator) -> int:
+        """The number of bowls of one scene."""
+        low, high = self.bowl_range
+        return int(rng.integers(low, high + 1)) if self.n_bowls is None else self.n_bowls
 
 
-def sample_scene(rng: np.random.Generator, request: SceneRequest, sizes: Sizes) -> Scene:
-    """Draw a scene: kinds, colours (no two alike), a goal that is not reached yet, and places."""
-    low, high = request.bowl_range
-    n_bowls = int(rng.integers(low, high + 1)) if request.n_bowls is None else request.n_bowls
-    wishes = request.wishes or _draw_wishes(rng, request)
-    named = [color for wish in wishes for color in wish]
-    others = rng.permutation([color for color in COLORS if color not in named]).tolist()
-    kinds = ["bowl"] * (n_bowls - len(wishes)) + ["block"] * (request.n_objects - n_bowls - len(wishes))
-    things = [(kind, color) for wish in wishes for kind, color in zip(("block", "bowl"), wish, strict=True)]
-    things += list(zip(kinds, others[: len(kinds)], strict=True))
+def sample_objects(
+    rng: np.random.Generator, request: SceneRequest, n_bowls: int, named: Sequence[Thing], sizes: Sizes
+) -> tuple[ObjectSpec, ...]:
+    """Draw the objects of a scene: the named things and others, no two colours alike, and their places.
+
+    Args:
+        rng: the source of chance.
+        request: what the scene must be like.
+        n_bowls: how many of the objects are bowls.
+        named: the things that the instruction names, of the kinds of ``request.named``.
+        sizes: of the objects.
+    """
+    named_colors = [thing.color for thing in named]
+    others = rng.permutation([color for color in COLORS if color not in named_colors]).tolist()
+    n_blocks = request.n_objects - n_bowls
+    kinds = ["bowl"] * (n_bowls - request.named.count("bowl"))
+    kinds += ["block"] * (n_blocks - request.named.count("block"))
+    things = [*named, *map(Thing, others[: len(kinds)], kinds)]
     # Ids carry no meaning: without the shuffle the target would always be object 0.
     things = [things[k] for k in rng.permutation(len(things))]
-    insides = _draw_insides(rng, request, things, wishes)
-    places = _draw_places(rng, [kind for kind, _ in things], insides, sizes)
-    objects = tuple(
-        ObjectSpec(kind, color, x, y, float(rng.uniform(-pi, pi)), insides.get(index))
-        for index, ((kind, color), (x, y)) in enumerate(zip(things, places, strict=True))
+    insides = _draw_insides(rng, request, things, named)
+    places = _draw_places(rng, [thing.kind for thing in things], insides, sizes)
+    return tuple(
+        ObjectSpec(thing.kind, thing.color, x, y, float(rng.uniform(-pi, pi)), insides.get(index))
+        for index, (thing, (x, y)) in enumerate(zip(things, places, strict=True))
     )
-    return Scene(objects, find_goal(objects, wishes))
 
 
-def jitter_arm(rng: np.random.Generator, scene: Scene) -> Scene:
-    """The scene with a randomly perturbed start pose of the arm; the tool stays upright enough to look as at
-    home."""
+def arm_jitter(rng: np.random.Generator) -> tuple[float, ...]:
+    """Random joint offsets (6,) in radians of the arm's start pose; the tool stays upright."""
     pan, lift, elbow = rng.uniform(-ARM_JITTER, ARM_JITTER, size=3).tolist()
-    return replace(scene, arm_offset=(pan, lift, elbow, -lift - elbow, 0.0, 0.0))
-
-
-def _draw_wishes(rng: np.random.Generator, request: SceneRequest) -> tuple[ColorPair, ...]:
-    colors = rng.permutation(CAPTION_COLORS[request.color_split])[: 2 * request.n_pairs].tolist()
-    return tuple(ColorPair(*colors[k : k + 2]) for k in range(0, len(colors), 2))
+    return pan, lift, elbow, -lift - elbow, 0.0, 0.0
 
 
 def _draw_insides(
-    rng: np.random.Generator,
-    request: SceneRequest,
-    things: list[tuple[str, str]],
-    wishes: tuple[ColorPair, ...],
+    rng: np.random.Generator, request: SceneRequest, things: Sequence[Thing], named: Sequence[Thing]
 ) -> dict[int, int]:
     """Block id -> id of the bowl that it starts in."""
-    named = {("block", wish.block) for wish in wishes} | {("bowl", wish.bowl) for wish in wishes}
     free = [index for index, thing in enumerate(things) if thing not in named]
-    blocks = rng.permutation([index for index in free if things[index][0] == "block"]).tolist()
-    bowls = rng.permutation([index for index in free if things[index][0] == "bowl"]).tolist()
+    blocks = rng.permutation([index for index in free if things[index].kind == "block"]).tolist()
+    bowls = rng.permutation([index for index in free if things[index].kind == "bowl"]).tolist()
     filling = [int(block) for block in blocks[: request.blocks_in_bowls]]
     if request.target_in_bowl:
-        filling.append(things.index(("block", wishes[0].block)))
+        filling.append(things.index(named[0]))
     return {block: int(bowl) for block, bowl in zip(filling, bowls, strict=False)}
 
 

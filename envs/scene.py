@@ -1,21 +1,53 @@
-"""What a scene is: objects on a table, a goal, and where the arm starts. Plain values, no physics."""
+"""What a scene is and what may be asked of it: plain values, no physics, no task."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from envs.colors import COLORS
 from envs.geometry import WORKSPACE, Sizes
-from envs.language import ColorPair, format_instruction, parse_instruction
 
 KINDS = ("block", "bowl")
 MAX_OBJECTS = 8
 """As many objects as fit side by side into the workspace, each visible."""
+
+
+class Thing(NamedTuple):
+    """An object as a sentence names it. No two objects of a scene share a colour."""
+
+    color: str
+    kind: str
+
+    def __str__(self) -> str:
+        return f"{self.color} {self.kind}"
+
+
+class Instruction(NamedTuple):
+    """One step of a sentence: a thing shall have a relation ("in", ...) to a target."""
+
+    relation: str
+    thing: Thing
+    target: Thing
+
+    @property
+    def things(self) -> tuple[Thing, Thing]:
+        return self.thing, self.target
+
+    def __str__(self) -> str:
+        return f"the {self.thing} {self.relation} the {self.target}"
+
+
+class GoalPair(NamedTuple):
+    """An instruction in a scene: the ids of the object that shall move and of that at which it shall end."""
+
+    relation: str
+    thing: int
+    target: int
 
 
 @dataclass(frozen=True)
@@ -30,47 +62,22 @@ class ObjectSpec:
     inside: int | None = None
 
     @property
-    def name(self) -> str:
-        return f"{self.color} {self.kind}"
+    def thing(self) -> Thing:
+        return Thing(self.color, self.kind)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene to build: objects, goal pairs of (block id, bowl id), and the arm's start as joint offsets
-    (radians)."""
+    """A scene to build."""
 
     objects: tuple[ObjectSpec, ...]
-    goal: tuple[tuple[int, int], ...]
-    arm_offset: tuple[float, ...] = (0.0,) * 6
-
-    @property
-    def instruction(self) -> str:
-        return format_instruction(
-            (self.objects[block].color, self.objects[bowl].color) for block, bowl in self.goal
-        )
-
-
-def find_goal(
-    objects: Sequence[ObjectSpec], instruction: str | Iterable[ColorPair]
-) -> tuple[tuple[int, int], ...]:
-    """Ids of the (block, bowl) pairs that an instruction names.
-
-    Raises:
-        ValueError: when the instruction cannot be read, or names a thing that the scene does not have.
-    """
-    wishes = parse_instruction(instruction) if isinstance(instruction, str) else tuple(instruction)
-    ids = {(item.kind, item.color): index for index, item in enumerate(objects)}
-    for wish in wishes:
-        for kind, color in zip(KINDS, wish, strict=True):
-            if (kind, color) not in ids:
-                there = ", ".join(item.name for item in objects)
-                raise ValueError(f"the scene has no {color} {kind}; it has: {there}")
-    return tuple((ids["block", wish.block], ids["bowl", wish.bowl]) for wish in wishes)
+    goal: tuple[GoalPair, ...]
+    instruction: str
+    """The sentence that asks for the goal."""
 
 
 def read_layout(items: Any, sizes: Sizes) -> tuple[ObjectSpec, ...]:
-    """Check an explicit layout: a sequence of mappings with `kind`, `color`, `xy` (metres) and optionally
-    `yaw`.
+    """Check an explicit layout: a sequence of mappings with `kind`, `color`, `xy` (metres), optionally `yaw`.
 
     ``info["objects"]`` of an earlier `reset` is a layout too: `position` and `orientation` (a quaternion)
     stand for `xy` and `yaw`. A block whose centre is within a bowl's floor lies in that bowl.
@@ -88,9 +95,6 @@ def read_layout(items: Any, sizes: Sizes) -> tuple[ObjectSpec, ...]:
     twice = sorted({color for color in colors if colors.count(color) > 1})
     if twice:
         raise ValueError(f"no two objects may share a colour, but {', '.join(twice)} is there more than once")
-    for kind in KINDS:
-        if all(item.kind != kind for item in objects):
-            raise ValueError(f"a layout has at least one {kind}")
     return tuple(_find_insides(objects, sizes))
 
 
@@ -135,7 +139,7 @@ def _find_insides(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
     for index in filled:
         if filled.count(index) > 1:
             raise ValueError(
-                f"the {placed[index].name} has room for one block at the start, not {filled.count(index)}"
+                f"the {placed[index].thing} has room for one block at the start, not {filled.count(index)}"
             )
     for index, item in enumerate(placed):
         for other in placed[:index]:
@@ -144,7 +148,7 @@ def _find_insides(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
             needed = sizes.footprint(item.kind) + sizes.footprint(other.kind)
             if hypot(item.x - other.x, item.y - other.y) < needed:
                 raise ValueError(
-                    f"the {item.name} and the {other.name} overlap; their centres must be at least "
+                    f"the {item.thing} and the {other.thing} overlap; their centres must be at least "
                     f"{needed:.3f} m apart, or a block within {inside_radius(sizes):.3f} m of a bowl's "
                     "centre to lie in it"
                 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from math import pi
 from typing import Any
 
@@ -10,11 +11,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs.geometry import WORKSPACE
-from envs.language import CHARSET, format_instruction
-from envs.motion import MAX_SPEED, MAX_TURN
+from envs.physics.motion import MAX_SPEED, MAX_TURN
 
 EXTRAS = ("depth", "segmentation", "proprio")
 """Observations beside `rgb` and `instruction`, on request."""
+
+CHARSET = string.ascii_lowercase + " "
+"""Characters an instruction is made of. Gymnasium's default charset for ``Text`` lacks the space."""
 
 EE_NAMES = ("dx", "dy", "dz", "dyaw", "suction")
 PRIMITIVE_NAMES = ("pick_x", "pick_y", "place_x", "place_y", "yaw")
@@ -54,12 +57,17 @@ def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
     )
 
 
-def observation_space(size: int, far: float, max_pairs: int, extras: tuple[str, ...]) -> spaces.Dict:
-    """`rgb`, `instruction` and ``extras`` for images of ``size``, seen at most ``far`` metres away."""
-    longest = len(format_instruction([("yellow", "yellow")] * max_pairs))
+def observation_space(size: int, far: float, longest: int, extras: tuple[str, ...]) -> spaces.Dict:
+    """The space of observations.
+
+    Args:
+        size: height and width of the images.
+        far: the largest depth, metres.
+        longest: characters of the longest instruction.
+        extras: which of `EXTRAS` there are.
+    """
     parts: dict[str, spaces.Space[Any]] = {
         "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
-        # Gymnasium's default charset has no space.
         "instruction": spaces.Text(longest, min_length=1, charset=CHARSET),
     }
     possible: dict[str, spaces.Space[Any]] = {

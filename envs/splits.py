@@ -18,6 +18,8 @@ class Split:
 
     name: str
     number: int
+    task: str = "put_block_in_bowl"
+    """A name of `envs.tasks.TASKS`."""
     n_objects: int = 6
     color_split: ColorSplit = "seen"
     bowls: tuple[int, int] = (1, 5)

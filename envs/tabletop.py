@@ -1,27 +1,27 @@
-"""The Gymnasium environments `PutBlockInBowl-v0` and `PutBlocksInBowls-v0`."""
+"""The Gymnasium environment of all tasks: a robot arm, a table with blocks and bowls, and a sentence."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import dist
-from typing import Any, ClassVar, Literal, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.arguments import check_choice, check_range
-from envs.camera import PRESETS, Camera
+from envs.checks import check_choice, check_range
+from envs.colors import palette
 from envs.geometry import Sizes
-from envs.goal import is_inside, is_near
-from envs.motion import Action, pick_and_place
 from envs.options import read_options
-from envs.recording import Recorder
-from envs.robot import HOME, Robot
-from envs.sampling import SceneRequest
+from envs.physics.camera import PRESETS, Camera
+from envs.physics.motion import Action, pick_and_place
+from envs.physics.recorder import Recorder
+from envs.physics.robot import HOME, Robot
+from envs.physics.simulation import FIRST_OBJECT, Tabletop
 from envs.scene import Scene
-from envs.simulation import Tabletop
 from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
+from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
 EE_SECONDS = 5.0
@@ -32,8 +32,14 @@ HOME_TOLERANCE = 0.02
 """How close to its resting place, in metres, the arm must be for a solved episode to end."""
 
 
-class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
-    """Put the named block into the named bowl, with a suction gripper, following one sentence.
+class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
+    """Do what one sentence asks, with a suction gripper.
+
+    ## Description
+    The task says which sentences there are and when they are fulfilled: "put_block_in_bowl"
+    (`PutBlockInBowl-v0`: put the named block into the named bowl), "put_blocks_in_bowls"
+    (`PutBlocksInBowls-v0`: 2 or 3 blocks, each into its bowl). A goal is a list of pairs of a thing that
+    shall move and a target at which it shall end.
 
     ## Observation
     A dict: `rgb` (H, W, 3) uint8 and `instruction` (text). With ``extras``: `depth` (H, W) float32 in metres,
@@ -54,11 +60,13 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Info
     Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`,
-    `target` (goal pairs as an array (P, 2) of block id and bowl id), `objects` (a list of dicts with id,
-    kind, color, position and orientation), `segmentation`, `camera` (`intrinsics` (3, 3) and `extrinsics` (4,
-    4) world -> camera, OpenCV's frame; the centre of the top-left pixel is (0.5, 0.5)), `gripper` (position,
-    yaw, holding: an object id or -1), `sim_step`. With ``record_frames=True`` also `frames` (T, H, W, 3),
-    `frame_segmentations` (T, H, W) and `frame_states`: the frames of this step, or the one of `reset`.
+    `target` (goal pairs as an array (P, 2): the id of the object that shall move, the id of the object at
+    which it shall end), `objects` (a list of dicts with id, label (its value in the segmentation), kind,
+    color, position and orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`,
+    `table`), `camera` (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the
+    centre of the top-left pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1),
+    `sim_step`. With ``record_frames=True`` also `frames` (T, H, W, 3), `frame_segmentations` (T, H, W) and
+    `frame_states`: the frames of this step, or the one of `reset`.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -70,6 +78,9 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
     `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles.
 
     Args:
+        task: a name of `envs.tasks.TASKS`, or a task of your own.
+        n_pairs: how many pairs a random goal has; by default the task's fewest. An instruction in `reset`'s
+            options may name from 1 to the task's most.
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
         camera: "close" (the workspace fills the frame) or "paper" (the camera of the paper's frames).
@@ -88,11 +99,11 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
 
     # Not a ClassVar, because Gymnasium declares it so.
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}  # noqa: RUF012
-    n_pairs: int = 1
-    max_pairs: ClassVar[int] = 1
 
     def __init__(
         self,
+        task: str | Task = "put_block_in_bowl",
+        n_pairs: int | None = None,
         control: Literal["primitive", "ee"] = "primitive",
         image_size: int = 64,
         camera: str = "close",
@@ -105,6 +116,11 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         record_frames: bool = False,
         render_mode: str | None = None,
     ) -> None:
+        if isinstance(task, str):
+            check_choice("task", task, TASKS)
+        self.task = TASKS[task] if isinstance(task, str) else task
+        self.n_pairs = self.task.pairs[0] if n_pairs is None else n_pairs
+        check_range("n_pairs", self.n_pairs, *self.task.pairs, whole=True)
         check_choice("control", control, ("primitive", "ee"))
         check_choice("camera", camera, PRESETS)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
@@ -126,9 +142,11 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         self._box = primitive_space(place_yaw) if primitive else ee_space(render_stride / physics_hz)
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
         self.observation_space = observation_space(
-            image_size, self.camera.preset.far, self.max_pairs, self.extras
+            image_size, self.camera.preset.far, self.task.longest_sentence, self.extras
         )
-        self.world = Tabletop(self.camera, Sizes(object_scale), physics_hz, gui=render_mode == "human")
+        self.world = Tabletop(
+            self.camera, Sizes().scaled(object_scale), physics_hz, gui=render_mode == "human"
+        )
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.world, self.robot)
         self._scene: Scene | None = None
@@ -153,13 +171,7 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: for options that are not allowed, before anything changes.
         """
-        defaults = SceneRequest(n_pairs=self.n_pairs)
-        checked = read_options(options, defaults, self.world.sizes)
-        if checked.wishes is not None and len(checked.wishes) > self.max_pairs:
-            raise ValueError(
-                f"{type(self).__name__} takes instructions of at most {self.max_pairs} (block, bowl) pairs, "
-                f"not {len(checked.wishes)}"
-            )
+        checked = read_options(options, self.task, self.task.request(self.n_pairs), self.world.sizes)
         super().reset(seed=seed)
         scene, joints = checked.draw(self.np_random, self.world.sizes)
         self.world.build(scene, joints)
@@ -190,7 +202,7 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
                 # Rendering changes nothing in the world, so unwanted frames are not drawn.
                 if self.record_frames or self.render_mode == "human":
                     self._recorder.capture()
-            if not self._recorder.frames:
+            if not self._recorder.images:
                 self._recorder.capture()
         else:
             self._move(values)
@@ -206,7 +218,7 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='rgb_array')")
             return None
-        return self._recorder.image.rgb.copy() if self.render_mode == "rgb_array" else None
+        return self._recorder.images[-1].rgb.copy() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Give PyBullet's memory back. Safe to call twice."""
@@ -216,13 +228,13 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         self.robot.move(action[:3], float(action[3]), bool(action[4] > 0.5))
 
     def _fulfilled(self) -> list[bool]:
-        return [is_inside(self.world, self.robot, block, bowl) for block, bowl in self.scene.goal]
+        return [self.task.relation(pair).fulfilled(self.world, self.robot, pair) for pair in self.scene.goal]
 
     def _is_home(self) -> bool:
         return dist(self.robot.state().position, HOME) < HOME_TOLERANCE
 
     def _observe(self) -> Observation:
-        image, observation = self._recorder.image, {}
+        image, observation = self._recorder.images[-1], {}
         observation["rgb"] = image.rgb.copy()
         observation["instruction"] = self.scene.instruction
         if "depth" in self.extras:
@@ -230,25 +242,22 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         if "segmentation" in self.extras:
             observation["segmentation"] = image.segmentation.copy()
         if "proprio" in self.extras:
-            state = self._recorder.newest
-            observation["proprio"] = np.concatenate([state.arm, state.gripper])
+            state = self._recorder.states[-1]
+            observation["proprio"] = np.concatenate([state["arm"], state["gripper"]])
         return observation
 
     def _info(self) -> dict[str, Any]:
-        world, goal, gripper = self.world, self.scene.goal, self.robot.state()
+        world, goal, grip = self.world, self.scene.goal, self.robot.state()
         info: dict[str, Any] = {
             "is_success": all(self._fulfilled()),
-            "cliport_success": all(is_near(world, block, bowl) for block, bowl in goal),
+            "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
-            "target": np.array(goal),
+            "target": np.array([(pair.thing, pair.target) for pair in goal]),
             "objects": self._object_infos(),
-            "segmentation": self._recorder.image.segmentation.copy(),
+            "segmentation": self._recorder.images[-1].segmentation.copy(),
+            "palette": palette(),
             "camera": {"intrinsics": self.camera.intrinsics, "extrinsics": self.camera.extrinsics},
-            "gripper": {
-                "position": np.array(gripper.position),
-                "yaw": gripper.yaw,
-                "holding": gripper.holding,
-            },
+            "gripper": {"position": np.array(grip.position), "yaw": grip.yaw, "holding": grip.holding},
             "sim_step": world.steps,
         }
         if self.record_frames:
@@ -259,32 +268,6 @@ class PutBlockInBowl(gym.Env[Observation, NDArray[np.float32]]):
         infos = []
         for index, item in enumerate(self.scene.objects):
             position, orientation = map(np.array, self.world.pose(index))
-            infos.append(
-                {
-                    "id": index,
-                    "kind": item.kind,
-                    "color": item.color,
-                    "position": position,
-                    "orientation": orientation,
-                }
-            )
+            named = {"id": index, "label": FIRST_OBJECT + index, "kind": item.kind, "color": item.color}
+            infos.append(named | {"position": position, "orientation": orientation})
         return infos
-
-
-class PutBlocksInBowls(PutBlockInBowl):
-    """The long-horizon variant: the instruction lists 2 or 3 blocks, each with its bowl, in one scene.
-
-    Everything else is as in `PutBlockInBowl`.
-
-    Args:
-        n_pairs: how many (block, bowl) pairs a random goal has: 2 or 3. An instruction in `reset`'s options
-            may name 1 to 3.
-        options: the arguments of `PutBlockInBowl`.
-    """
-
-    max_pairs = 3
-
-    def __init__(self, n_pairs: int = 2, **options: Any) -> None:
-        check_range("n_pairs", n_pairs, 2, self.max_pairs, whole=True)
-        self.n_pairs = n_pairs
-        super().__init__(**options)

@@ -123,6 +123,7 @@ def test_wrong_tool_motions_are_refused_before_anything_moves(make: Make, action
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"task": "stack"}, "unknown task 'stack'; allowed: 'put_block_in_bowl'"),
         ({"control": "joints"}, "unknown control 'joints'; allowed: 'primitive', 'ee'"),
         ({"camera": "top"}, "unknown camera 'top'; allowed: 'paper', 'close'"),
         ({"render_mode": "ansi"}, "unknown render_mode 'ansi'"),

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs import Expert, format_instruction
-from envs.robot import HOME
+from envs import Expert
+from envs.physics.robot import HOME
 
 Make = Callable[..., gym.Env[Any, Any]]
 STARTS = (
@@ -85,10 +85,10 @@ def test_the_expert_plays_every_instruction_of_a_scene(make: Make) -> None:
     env = make(record_frames=True)
     _, start = env.reset(seed=9, options={"n_bowls": 3})
     colors = {kind: [o["color"] for o in start["objects"] if o["kind"] == kind] for kind in ("block", "bowl")}
-    wishes = list(product(colors["block"], colors["bowl"]))
-    assert len(wishes) == 9
-    for wish in wishes:
-        instruction = format_instruction([wish])
+    pairs = list(product(colors["block"], colors["bowl"]))
+    assert len(pairs) == 9
+    for block, bowl in pairs:
+        instruction = f"put the {block} block in the {bowl} bowl"
         _, info = env.reset(options={"layout": start["objects"], "instruction": instruction})
         assert info["instruction"] == instruction
         assert play(env)[2]["is_success"], instruction
@@ -99,7 +99,7 @@ def test_playing_another_instruction_does_not_reach_the_goal(make: Make) -> None
     _, info = env.reset(seed=9, options={"n_bowls": 3})
     block, bowl = info["target"][0]
     other = next(o for o in info["objects"] if o["kind"] == "bowl" and o["id"] != bowl)
-    instruction = format_instruction([(info["objects"][block]["color"], other["color"])])
+    instruction = f"put the {info['objects'][block]['color']} block in the {other['color']} bowl"
     reward, terminated, info, _ = play(env, instruction)
     assert (reward, terminated, info["is_success"]) == (0.0, False, False)
 
@@ -128,6 +128,6 @@ def test_the_expert_refuses_what_is_not_there(make: Make) -> None:
         color for color in ("white", "orange", "pink", "purple", "red", "blue") if color not in colors
     )
     with pytest.raises(ValueError, match=f"the scene has no {missing} block; it has: .*bowl"):
-        Expert(env).actions(format_instruction([(missing, colors[0])]))
+        Expert(env).actions(f"put the {missing} block in the {colors[0]} bowl")
     with pytest.raises(TypeError, match="not PendulumEnv"):
         Expert(gym.make("Pendulum-v1"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -12,14 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs import Expert, parse_instruction
+from envs import TASKS, Expert
 from envs.colors import CAPTION_COLORS, SEEN
 from envs.geometry import SPAWN, Sizes
-from envs.sampling import SceneRequest, sample_scene
 from envs.splits import SEEDS_PER_SPLIT, SPLITS
 
 Make = Callable[..., gym.Env[Any, Any]]
 SIZES = Sizes()
+TASK = TASKS["put_block_in_bowl"]
 
 
 @given(
@@ -30,13 +31,13 @@ SIZES = Sizes()
 )
 @settings(max_examples=60, deadline=None)
 def test_a_random_scene_is_what_was_asked_for(seed: int, n_objects: int, split: Any, filled: int) -> None:
-    request = SceneRequest(n_objects=n_objects, color_split=split, blocks_in_bowls=filled)
-    scene = sample_scene(np.random.default_rng(seed), request, SIZES)
+    request = replace(TASK.request(), n_objects=n_objects, color_split=split, blocks_in_bowls=filled)
+    scene = TASK.sample(np.random.default_rng(seed), request, SIZES)
     assert len(scene.objects) == n_objects
     assert {item.kind for item in scene.objects} == {"block", "bowl"}
     colors = [item.color for item in scene.objects]
     assert len(set(colors)) == n_objects
-    (block, bowl), *_ = scene.goal
+    (_, block, bowl), *_ = scene.goal
     assert {scene.objects[block].color, scene.objects[bowl].color} <= set(CAPTION_COLORS[split])
     assert scene.objects[block].inside is None
     inside = [item.inside for item in scene.objects if item.inside is not None]
@@ -48,9 +49,9 @@ def test_a_random_scene_is_what_was_asked_for(seed: int, n_objects: int, split: 
 
 
 def test_the_fullest_scenes_always_find_room() -> None:
-    request = SceneRequest(n_objects=8, n_bowls=5)
+    request = replace(TASK.request(), n_objects=8, n_bowls=5)
     for seed in range(15):
-        assert len(sample_scene(np.random.default_rng(seed), request, SIZES).objects) == 8
+        assert len(TASK.sample(np.random.default_rng(seed), request, SIZES).objects) == 8
 
 
 def test_scenes_start_at_rest_and_unsolved(make: Make) -> None:
@@ -105,13 +106,13 @@ def test_one_scene_can_be_told_other_instructions(make: Make) -> None:
     first, info = env.reset(seed=21, options={"n_bowls": 5})
     bowls = [item["color"] for item in info["objects"] if item["kind"] == "bowl"]
     for color in bowls:
-        text = f"put the {parse_instruction(info['instruction'])[0].block} block in the {color} bowl"
+        text = f"put the {TASK.parse(info['instruction'])[0].thing.color} block in the {color} bowl"
         again, _ = env.reset(options={"layout": info["objects"], "instruction": text})
         assert again["instruction"] == text
         assert (again["rgb"] == first["rgb"]).mean() > 0.995
         again, _ = env.reset(options={"layout": info["objects"]})
-        wish = parse_instruction(again["instruction"])[0]
-        assert {wish.block, wish.bowl} <= set(SEEN)
+        (step,) = TASK.parse(again["instruction"])
+        assert {thing.color for thing in step.things} <= set(SEEN)
 
 
 def test_a_layout_is_built_where_it_says(make: Make) -> None:
@@ -160,8 +161,9 @@ def test_splits_are_disjoint_and_as_described(make: Make) -> None:
             seed = split.seed(episode)
             _, info = env.reset(seed=seed, options=split.options(seed))
             kinds = [item["kind"] for item in info["objects"]]
-            wish = parse_instruction(info["instruction"])[0]
-            assert len(kinds) == n_objects and set(wish) <= set(CAPTION_COLORS[colors])
+            (step,) = TASK.parse(info["instruction"])
+            assert len(kinds) == n_objects
+            assert {thing.color for thing in step.things} <= set(CAPTION_COLORS[colors])
             assert 1 <= kinds.count("bowl") <= 5 and not info["is_success"]
             if name == "controllability":
                 assert kinds.count("bowl") >= 4

@@ -11,18 +11,21 @@ import pybullet as p
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from envs.arm import Joints, arm_urdf
-from envs.camera import Camera
 from envs.colors import COLORS, FLOOR_RGB, TABLE_RGB
-from envs.geometry import TABLE, Sizes
+from envs.geometry import BLOCK_MASS, BOWL_MASS, TABLE, Sizes
+from envs.physics.arm import Joints, arm_urdf
+from envs.physics.camera import Camera
+from envs.physics.shapes import bowl_contact_file, bowl_mesh
 from envs.scene import Scene
-from envs.shapes import bowl_contact_file, bowl_mesh
 
 GRAVITY = -9.8
 TABLE_THICKNESS = 0.04
 
-BACKGROUND, ARM, FIRST_OBJECT = 0, 1, 2
-"""Labels of a segmentation: table and floor, the arm, and object i as FIRST_OBJECT + i."""
+LABELS = {"background": 0, "robot": 1}
+"""Labels of a segmentation that every scene has: table and floor, and the robot."""
+
+FIRST_OBJECT = 2
+"""Object i has the label FIRST_OBJECT + i."""
 
 # Mild light from above the camera's shoulder, and no shadow: faces and the rim of a bowl stay readable, yet a
 # thing keeps about one colour, the one it is named after. Ambient and diffuse light add up to about 1 on a
@@ -88,7 +91,7 @@ class Tabletop:
         self._add_objects(scene)
         self.steps = 0
         self._label = np.zeros(2 + max([table, self.arm, *self.objects]), dtype=np.uint8)
-        self._label[self.arm + 1] = ARM
+        self._label[self.arm + 1] = LABELS["robot"]
         for index, body in enumerate(self.objects):
             self._label[body + 1] = FIRST_OBJECT + index
 
@@ -169,7 +172,7 @@ class Tabletop:
                 look = p.createVisualShape(
                     p.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client
                 )
-                touch, mass, z = block_touch, sizes.block_mass, floor + sizes.block / 2
+                touch, mass, z = block_touch, BLOCK_MASS, floor + sizes.block / 2
             else:
                 look = p.createVisualShape(
                     p.GEOM_MESH,
@@ -179,7 +182,7 @@ class Tabletop:
                     rgbaColor=rgba,
                     physicsClientId=client,
                 )
-                touch, mass, z = bowl_touch, sizes.bowl_mass, 0.0
+                touch, mass, z = bowl_touch, BOWL_MASS, 0.0
             turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])
             body = p.createMultiBody(mass, touch, look, [item.x, item.y, z], turn, physicsClientId=client)
             p.changeDynamics(body, -1, lateralFriction=1.0, physicsClientId=client)
@@ -205,7 +208,7 @@ def _empty_table(camera: Camera) -> Image:
     on_table = (TABLE.x[0] <= x) & (x <= TABLE.x[1]) & (TABLE.y[0] <= y) & (y <= TABLE.y[1])
     rgb = np.where(on_table[:, None], np.array(TABLE_RGB), np.array(FLOOR_RGB)).astype(np.uint8)
     depth = np.where(on_table, depth, camera.preset.far).astype(np.float32)
-    nothing = np.full((size, size), BACKGROUND, dtype=np.uint8)
+    nothing = np.full((size, size), LABELS["background"], dtype=np.uint8)
     return Image(rgb.reshape(size, size, 3), nothing, depth.reshape(size, size))
 
 

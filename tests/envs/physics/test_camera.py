@@ -9,9 +9,9 @@ import numpy as np
 import pybullet as p
 import pytest
 
-from envs.camera import PRESETS, Camera
-from envs.colors import ARM_RGB, COLORS
+from envs.colors import COLORS, ROBOT_RGB
 from envs.geometry import SPAWN, WORKSPACE, Sizes
+from envs.physics.camera import PRESETS, Camera
 
 Make = Callable[..., gym.Env[Any, Any]]
 SIZES = Sizes()
@@ -132,8 +132,29 @@ def test_colours_are_the_named_ones(make: Make) -> None:
             assert share.min() > 0.6 and share.max() < 1.1
             assert np.abs(np.median(pixels, axis=0) - named).max() < 0.16 * 255
             assert (share.max(axis=1) - share.min(axis=1)).max() < 0.1
-        share = rgb[label == 1] / np.array(ARM_RGB)
+        share = rgb[label == 1] / np.array(ROBOT_RGB)
         assert (share.max(axis=1) - share.min(axis=1)).max() < 0.1
+
+
+def test_labels_and_palette_of_the_info_are_what_is_drawn(make: Make) -> None:
+    """From `info` alone: each object's pixels carry its label, and the palette's colour up to shading."""
+    env = make(image_size=128)
+    for seed in range(4):
+        observation, info = env.reset(seed=seed, options={"color_split": "all"})
+        rgb, segmentation, palette = observation["rgb"].astype(float), info["segmentation"], info["palette"]
+        labels = [item["label"] for item in info["objects"]]
+        assert set(np.unique(segmentation)) == {0, 1, *labels} and len(set(labels)) == len(labels)
+        assert (rgb[segmentation == 0] == palette["table"]).all()
+        things = [(item["label"], palette["colors"][item["color"]]) for item in info["objects"]]
+        seen_at = {}
+        for label, color in [*things, (1, palette["robot"])]:
+            share = np.median(rgb[segmentation == label], axis=0) / color
+            assert share.min() > 0.6 and share.max() < 1.1 and np.ptp(share) < 0.1
+            rows, columns = np.nonzero(segmentation == label)
+            seen_at[label] = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        for item in info["objects"]:
+            (center,) = project(info["camera"], item["position"][None])
+            assert np.abs(seen_at[item["label"]] - center).max() < 8
 
 
 def test_the_paper_view_has_the_papers_floor_and_table(make: Make) -> None:

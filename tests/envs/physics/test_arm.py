@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envs.arm import TIP_LINK, arm_urdf, forward_kinematics, inverse_kinematics
-from envs.colors import ARM_RGB, COLORS, chroma
-from envs.robot import REACH_HIGH, REACH_LOW
+from envs.colors import COLORS, RGB, ROBOT_RGB
+from envs.physics.arm import TIP_LINK, arm_urdf, forward_kinematics, inverse_kinematics
+from envs.physics.robot import REACH_HIGH, REACH_LOW
 
 inside = st.tuples(*(st.floats(low, high) for low, high in zip(REACH_LOW, REACH_HIGH, strict=True)))
 
@@ -45,7 +45,14 @@ def test_points_out_of_reach_are_refused(point: tuple[float, float, float], mess
         inverse_kinematics(point, 0.0)
 
 
+def chroma(rgb: RGB) -> list[float]:
+    """Colour without brightness: (rgb - L) / (L + 0.2), with L the mean of rgb scaled to 0..1."""
+    values = [value / 255 for value in rgb]
+    light = sum(values) / 3
+    return [(value - light) / (light + 0.2) for value in values]
+
+
 @pytest.mark.parametrize("name", COLORS)
 def test_no_object_has_the_arms_hue(name: str) -> None:
-    distance = sum(abs(a - b) for a, b in zip(chroma(ARM_RGB), chroma(COLORS[name]), strict=True))
+    distance = sum(abs(a - b) for a, b in zip(chroma(ROBOT_RGB), chroma(COLORS[name]), strict=True))
     assert distance > 0.25

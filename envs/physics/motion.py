@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.robot import HOME, REACH_LOW, Robot
+from envs.physics.robot import HOME, REACH_LOW, Robot
 
 Action = NDArray[np.float32]
 """(5,): dx, dy, dz in metres, dyaw in radians, suction (on above 0.5)."""

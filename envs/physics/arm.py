@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 
-from envs.colors import ARM_RGB
-from envs.shapes import generated_file
+from envs.colors import ROBOT_RGB
+from envs.physics.shapes import generated_file
 
 Joints = tuple[float, float, float, float, float, float]
 Point = tuple[float, float, float]
-
-JOINT_NAMES = ("pan", "lift", "elbow", "wrist1", "wrist2", "wrist3")
 
 # Universal Robots' published lengths of the UR5, in metres.
 D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823
@@ -120,7 +118,7 @@ def _link(name: str, mass: float, visuals: list[str], contact: str = "", contact
 
 def _cylinder(radius: float, length: float, center: Point, along: str = "z") -> str:
     turn = {"x": f"0 {pi / 2} 0", "y": f"{pi / 2} 0 0", "z": "0 0 0"}[along]
-    color = " ".join(f"{value / 255:.4f}" for value in ARM_RGB)
+    color = " ".join(f"{value / 255:.4f}" for value in ROBOT_RGB)
     return (
         f'<visual><origin xyz="{center[0]} {center[1]} {center[2]}" rpy="{turn}"/>'
         f'<geometry><cylinder radius="{radius}" length="{length}"/></geometry>'

@@ -12,8 +12,8 @@ import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 
-from envs.arm import TIP_LINK, Joints, Point, forward_kinematics, inverse_kinematics
-from envs.simulation import Tabletop
+from envs.physics.arm import TIP_LINK, Joints, Point, forward_kinematics, inverse_kinematics
+from envs.physics.simulation import Tabletop
 
 HOME: Point = (0.348, 0.0, 0.13)
 """Where the tip rests: seen at the upper edge of the `close` view, in front of no object."""

@@ -1,0 +1,11 @@
+"""What may be asked for on the tabletop: one file a task, one line here."""
+
+from envs.tasks.base import Question, Relation, Task
+from envs.tasks.put_in_bowl import In
+
+TASKS: dict[str, Task] = {
+    "put_block_in_bowl": Task((In(),)),
+    "put_blocks_in_bowls": Task((In(),), pairs=(2, 3)),
+}
+
+__all__ = ["TASKS", "In", "Question", "Relation", "Task"]

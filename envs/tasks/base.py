@@ -1,0 +1,254 @@
+"""What a task is: the sentences that may be said, the scenes, what the expert does, and when it is done."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import dist
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
+from envs.geometry import Sizes
+from envs.physics.robot import Robot
+from envs.physics.simulation import Tabletop
+from envs.sampling import SceneRequest, sample_objects
+from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
+
+CLIPORT_RADIUS = 0.05
+"""CLIPort calls it success when an object is this close to its place in the plane (metres)."""
+
+SETTLED_SPEED = 0.05
+"""In m/s. A resting block of a few grams jitters by up to a fifth of this in PyBullet's contact solver."""
+
+
+class Question(NamedTuple):
+    """A sentence of one step that a scene allows."""
+
+    text: str
+    moves: int
+    """Id of the object that should move."""
+    ends_at: int
+    """Id of the object at which it should end."""
+
+
+class Relation(ABC):
+    """What one instruction asks: ``the <color> <thing> <name> the <color> <target>`` shall be true.
+
+    The expert picks at the thing and lets go at `place`.
+    """
+
+    name: ClassVar[str]
+    """The words between thing and target, such as "in"."""
+    kinds: ClassVar[tuple[str, str]]
+    """Kinds of the thing, which moves, and of the target, at which it ends."""
+    exclusive: ClassVar[bool] = False
+    """Whether a target has room for one thing only."""
+
+    def between(self, thing_color: str, target_color: str) -> Instruction:
+        """The instruction that asks for it."""
+        thing, target = self.kinds
+        return Instruction(self.name, Thing(thing_color, thing), Thing(target_color, target))
+
+    @abstractmethod
+    def fulfilled(self, world: Tabletop, robot: Robot, pair: GoalPair) -> bool:
+        """Whether it is true now. The simulator alone judges."""
+
+    @abstractmethod
+    def fulfilled_at_start(self, objects: Sequence[ObjectSpec], thing: int, target: int) -> bool:
+        """Whether it is true of two objects (ids) of a layout."""
+
+    def place(self, world: Tabletop, pair: GoalPair) -> tuple[float, float]:
+        """Where to let go of the thing, (x, y) in metres: over the target's centre."""
+        x, y, _ = world.pose(pair.target)[0]
+        return x, y
+
+    def is_near(self, world: Tabletop, pair: GoalPair) -> bool:
+        """CLIPort's criterion: the thing is within 5 cm of its place in the plane, in hand or not."""
+        return dist(world.pose(pair.thing)[0][:2], self.place(world, pair)) < CLIPORT_RADIUS
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an environment may ask for: ``put the red block in the blue bowl [and the ...]``.
+
+    Random scenes name things for the first relation; a task that wants others overrides `sample`.
+    """
+
+    relations: tuple[Relation, ...]
+    pairs: tuple[int, int] = (1, 1)
+    """Fewest and most (thing, target) pairs of a random goal. A given instruction has 1 to the most."""
+
+    @property
+    def grammar(self) -> str:
+        """The form of the sentences, for messages."""
+        step = " | ".join(str(relation.between("<color>", "<color>")) for relation in self.relations)
+        return f"put {step} [and {step} ...]"
+
+    @property
+    def vocabulary(self) -> tuple[str, ...]:
+        """Every word that the sentences can contain, in a fixed order: the grammar's, then the colours."""
+        words = " ".join(["put", *(str(relation.between("", "")) for relation in self.relations)]).split()
+        words += ["and"] * (self.pairs[1] > 1)
+        return tuple(dict.fromkeys([*words, *COLORS]))
+
+    @property
+    def longest_sentence(self) -> int:
+        """Characters of the longest sentence."""
+        color = max(COLORS, key=len)
+        return max(len(self.format([r.between(color, color)] * self.pairs[1])) for r in self.relations)
+
+    def format(self, instructions: Iterable[Instruction]) -> str:
+        """The sentence that asks for ``instructions``, in their order.
+
+        Raises:
+            ValueError: for no instruction at all, or a colour that does not exist.
+        """
+        steps = list(instructions)
+        if not steps:
+            raise ValueError("a sentence needs at least one instruction")
+        for step in steps:
+            _check_colors(step)
+        return "put " + " and ".join(map(str, steps))
+
+    def parse(self, text: str) -> tuple[Instruction, ...]:
+        """The instructions of a sentence; the inverse of `format`.
+
+        Letter case, repeated spaces and a final full stop do not matter.
+
+        Raises:
+            ValueError: when the text is not of the grammar, names an unknown colour, or moves a thing twice.
+        """
+        form = f"the form is: {self.grammar}"
+        if not isinstance(text, str):
+            raise ValueError(f"an instruction is a string, not {type(text).__name__}; {form}")
+        plain = " ".join(text.lower().rstrip(". ").split())
+        if not plain.startswith("put "):
+            raise ValueError(f"cannot read the instruction {text!r}; {form}")
+        steps: list[Instruction] = []
+        for part in plain.removeprefix("put ").split(" and "):
+            step = self._parse_step(part)
+            if step is None:
+                raise ValueError(f"cannot read {part!r} in the instruction {text!r}; {form}")
+            _check_colors(step)
+            if step.thing in [before.thing for before in steps]:
+                raise ValueError(f"the instruction {text!r} names one {step.thing.kind} twice")
+            steps.append(step)
+        return tuple(steps)
+
+    def check_instructions(self, instructions: Sequence[Instruction]) -> None:
+        """Refuse what no scene of the task can be asked for.
+
+        Raises:
+            ValueError: for too many instructions, or a target named twice that has room for one thing.
+        """
+        if len(instructions) > self.pairs[1]:
+            raise ValueError(
+                f"this environment takes instructions of at most {self.pairs[1]} (thing, target) pairs, "
+                f"not {len(instructions)}"
+            )
+        for relation in self.relations:
+            targets = [step.target for step in instructions if step.relation == relation.name]
+            if relation.exclusive and len(set(targets)) < len(targets):
+                thing, target = relation.kinds
+                raise ValueError(
+                    f"an instruction must not name a {target} twice: a {target} has room for one {thing}"
+                )
+
+    def relation(self, step: GoalPair | Instruction) -> Relation:
+        """The relation that a goal pair or an instruction names."""
+        return next(relation for relation in self.relations if relation.name == step.relation)
+
+    def find_goal(
+        self, objects: Sequence[ObjectSpec], instructions: Iterable[Instruction]
+    ) -> tuple[GoalPair, ...]:
+        """The ids of what is named.
+
+        Raises:
+            ValueError: when the scene does not have a named thing.
+        """
+        ids = {item.thing: index for index, item in enumerate(objects)}
+        steps = tuple(instructions)
+        for thing in (thing for step in steps for thing in step.things):
+            if thing not in ids:
+                there = ", ".join(str(item.thing) for item in objects)
+                raise ValueError(f"the scene has no {thing}; it has: {there}")
+        return tuple(GoalPair(step.relation, ids[step.thing], ids[step.target]) for step in steps)
+
+    def request(self, n_pairs: int = 1) -> SceneRequest:
+        """What random scenes are like by default, with ``n_pairs`` (thing, target) pairs to name."""
+        return SceneRequest(named=self.relations[0].kinds * n_pairs)
+
+    def sample(self, rng: np.random.Generator, request: SceneRequest, sizes: Sizes) -> Scene:
+        """Draw a scene: kinds, colours, a goal that is not reached yet, and places."""
+        n_bowls = request.draw_n_bowls(rng)
+        steps = request.instructions or self._draw_instructions(rng, request)
+        objects = sample_objects(rng, request, n_bowls, [t for step in steps for t in step.things], sizes)
+        return self.scene(objects, self.find_goal(objects, steps))
+
+    def scene(self, objects: tuple[ObjectSpec, ...], goal: tuple[GoalPair, ...]) -> Scene:
+        """A given layout with a goal."""
+        steps = [Instruction(p.relation, objects[p.thing].thing, objects[p.target].thing) for p in goal]
+        return Scene(objects, goal, self.format(steps))
+
+    def open_pairs(self, objects: Sequence[ObjectSpec], color_split: ColorSplit) -> list[GoalPair]:
+        """What may be asked for in a layout: its colours may be named, it is not so yet, there is room."""
+        colors = CAPTION_COLORS[color_split]
+        found = []
+        for pair in self._pairs(objects):
+            relation = self.relation(pair)
+            rivals = range(len(objects)) if relation.exclusive else [pair.thing]
+            taken = any(relation.fulfilled_at_start(objects, rival, pair.target) for rival in rivals)
+            if not taken and all(objects[index].color in colors for index in (pair.thing, pair.target)):
+                found.append(pair)
+        return found
+
+    def draw_goal(
+        self, rng: np.random.Generator, objects: Sequence[ObjectSpec], color_split: ColorSplit, n_pairs: int
+    ) -> tuple[GoalPair, ...]:
+        """Up to ``n_pairs`` open pairs of a layout; none shares a thing or a target with another."""
+        goal: list[GoalPair] = []
+        pairs = self.open_pairs(objects, color_split)
+        while pairs and len(goal) < n_pairs:
+            goal.append(pairs[int(rng.integers(len(pairs)))])
+            pairs = [
+                pair for pair in pairs if pair.thing != goal[-1].thing and pair.target != goal[-1].target
+            ]
+        return tuple(goal)
+
+    def questions(self, objects: Sequence[ObjectSpec]) -> tuple[Question, ...]:
+        """Every sentence of one step about the objects, also those that are true already."""
+        return tuple(
+            Question(self.scene(tuple(objects), (pair,)).instruction, pair.thing, pair.target)
+            for pair in self._pairs(objects)
+        )
+
+    def _pairs(self, objects: Sequence[ObjectSpec]) -> list[GoalPair]:
+        """All pairs of objects of the right kinds."""
+        ids = range(len(objects))
+        return [
+            GoalPair(relation.name, thing, target)
+            for relation in self.relations
+            for thing in ids
+            for target in ids
+            if thing != target and (objects[thing].kind, objects[target].kind) == relation.kinds
+        ]
+
+    def _parse_step(self, part: str) -> Instruction | None:
+        for relation in self.relations:
+            if match := re.fullmatch(str(relation.between("([a-z]+)", "([a-z]+)")), part):
+                return relation.between(*match.groups())
+        return None
+
+    def _draw_instructions(self, rng: np.random.Generator, request: SceneRequest) -> tuple[Instruction, ...]:
+        colors = rng.permutation(CAPTION_COLORS[request.color_split])[: len(request.named)].tolist()
+        return tuple(map(self.relations[0].between, colors[::2], colors[1::2]))
+
+
+def _check_colors(step: Instruction) -> None:
+    for thing in step.things:
+        if thing.color not in COLORS:
+            raise ValueError(f"unknown colour {thing.color!r}; allowed: {', '.join(COLORS)}")

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from envs import dataset
+from envs.collect import Args
+from envs.dataset import EpisodeConfig, collect, record_episode
+from envs.splits import SPLITS
+from envs.tabletop import TabletopEnv
+from envs.tasks import TASKS
+
+ROOT = Path(__file__).parents[2]
+# Small enough for CI: 16x16 pixels at 8 frames a second, in pieces of 3 episodes.
+SMALL = EpisodeConfig("val", image_size=16, render_stride=24)
+RUN = """
+import sys
+from pathlib import Path
+from envs import dataset
+dataset.EPISODES_PER_PIECE, dataset.EPISODES_PER_MERGE = 3, 6
+config = dataset.EpisodeConfig("val", image_size=16, render_stride=24)
+dataset.collect(config, 14, Path(sys.argv[1]), workers=1)
+"""
+
+
+@pytest.fixture(autouse=True)
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset, "EPISODES_PER_PIECE", 3)
+    monkeypatch.setattr(dataset, "EPISODES_PER_MERGE", 6)
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Every dataset and attribute of a file, as bytes."""
+    found: dict[str, bytes] = {}
+    with h5py.File(path) as file:
+        file.visititems(
+            lambda name, item: (
+                found.__setitem__(name, np.asarray(item[()]).astype("S200").tobytes())
+                if isinstance(item, h5py.Dataset) and item.dtype == object
+                else found.__setitem__(name, item[()].tobytes() if isinstance(item, h5py.Dataset) else b"")
+            )
+        )
+        found |= {f"@{name}": np.asarray(value).astype(str).tobytes() for name, value in file.attrs.items()}
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """14 episodes, collected in one undisturbed run."""
+    path = tmp_path_factory.mktemp("whole") / "val.h5"
+    collect(SMALL, 14, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[TabletopEnv]:
+    env = SMALL.make()
+    yield env
+    env.close()
+
+
+def test_the_file_holds_what_the_episodes_were(whole: Path, env: TabletopEnv) -> None:
+    recorded = record_episode(env, SMALL, 5)
+    with h5py.File(whole) as file:
+        index = file["episode"]
+        assert file.attrs["split"] == "val" and file.attrs["first_seed"] == SPLITS["val"].first_seed
+        assert index["seed"][:].tolist() == [SPLITS["val"].seed(number) for number in range(14)]
+        assert index["start"][:].tolist() == [0, *np.cumsum(index["length"])[:-1]]
+        assert file["frames"].shape == (index["length"][:].sum(), 16, 16, 3)
+        assert index["instruction"].asstr()[5] == recorded.instruction
+        assert index["success"][5] == recorded.success and index["success"][:].mean() > 0.9
+        start, length = index["start"][5], index["length"][5]
+        span, count = slice(start, start + length), len(recorded.objects)
+        for name in ("frames", "segmentation", "arm", "gripper"):
+            assert np.array_equal(file[name][span], recorded.arrays[name]), name
+        for name in ("object_position", "object_orientation"):
+            assert np.array_equal(file[name][span, :count], recorded.arrays[name]), name
+            assert np.isnan(file[name][span, count:]).all()
+        _, info = env.reset(seed=0)
+        assert np.allclose(file.attrs["camera_intrinsics"], info["camera"]["intrinsics"])
+        assert np.allclose(file.attrs["camera_extrinsics"], info["camera"]["extrinsics"])
+        assert '"pybullet"' in file.attrs["versions"]
+
+
+def test_the_file_says_what_its_labels_words_and_questions_are(whole: Path, env: TabletopEnv) -> None:
+    """Format version 2: a reader needs to know no task."""
+    with h5py.File(whole) as file:
+        assert (file.attrs["format"], file.attrs["format_version"]) == ("textocvp-episodes", 2)
+        assert "target" not in file["episode"]
+        labels = json.loads(file.attrs["labels"])
+        vocabulary = json.loads(file.attrs["vocabulary"])
+        assert labels == {"background": 0, "robot": 1}
+        assert vocabulary == list(TASKS["put_block_in_bowl"].vocabulary)
+        for number in range(14):
+            seed = int(file["episode/seed"][number])
+            _, info = env.reset(seed=seed, options=SPLITS["val"].options(seed))
+            objects = json.loads(file["episode/objects"].asstr()[number])
+            assert objects == [
+                {name: item[name] for name in ("id", "label", "kind", "color")} for item in info["objects"]
+            ]
+            known = {*labels.values(), *(item["label"] for item in objects)}
+            first = file["segmentation"][file["episode/start"][number]]
+            assert set(np.unique(first)) <= known and len(known) == len(objects) + 2
+            questions = json.loads(file["episode/questions"].asstr()[number])
+            played = [q for q in questions if q["text"] == file["episode/instruction"].asstr()[number]]
+            assert [(q["moves"], q["ends_at"]) for q in played] == [tuple(info["target"][0])]
+            words = {word for question in questions for word in question["text"].split()}
+            assert words <= set(vocabulary)
+            kinds = [item["kind"] for item in objects]
+            assert len(questions) == kinds.count("block") * kinds.count("bowl")
+
+
+def test_the_page_names_every_field(whole: Path) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    fields = [name for name in contents(whole) if name != "episode"]
+    assert len(fields) == 13 + 10
+    for name in fields:
+        assert f"| `{name.removeprefix('@')}` |" in page, name
+
+
+def test_the_example_of_the_page_writes_what_is_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python\n")[1].split("```")[0], {})
+    needed = {
+        line.split("`")[1] for line in page.splitlines() if line.startswith("| `") and "| yes |" in line
+    }
+    assert {name.removeprefix("@") for name in contents(tmp_path / "own.h5")} == {*needed, "episode"}
+    with h5py.File("own.h5") as file:
+        assert len(file["frames"]) == file["episode/length"][:].sum() == 51
+        assert file["episode/start"][:].tolist() == [0, 20]
+        assert file["episode/instruction"].asstr()[1] == "put the green block in the gray bowl"
+
+
+def test_two_workers_write_the_same_file(whole: Path, tmp_path: Path) -> None:
+    collect(SMALL, 14, tmp_path / "two.h5", workers=2)
+    assert contents(tmp_path / "two.h5") == contents(whole)
+    assert not (tmp_path / "two.h5.parts").exists()
+
+
+def test_a_finished_file_is_left_alone(whole: Path) -> None:
+    before = whole.stat()
+    collect(SMALL, 14, whole)
+    collect(SMALL, 3, whole)
+    assert whole.stat().st_mtime_ns == before.st_mtime_ns and whole.stat().st_ino == before.st_ino
+
+
+def test_a_file_can_be_extended(whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "growing.h5"
+    collect(SMALL, 4, path)
+    collect(SMALL, 14, path)
+    assert contents(path) == contents(whole)
+
+
+def test_killed_again_and_again_it_loses_and_doubles_nothing(whole: Path, tmp_path: Path) -> None:
+    """SIGKILL to the whole process group, soon after each new sign of progress, until a run comes through."""
+    path = tmp_path / "killed.h5"
+    kills = 0
+    for attempt in range(12):
+        process = subprocess.Popen(
+            [sys.executable, "-c", RUN, str(path)],
+            cwd=ROOT,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        before = progress(path)
+        while process.poll() is None and (attempt >= 8 or progress(path) == before):
+            time.sleep(0.002)
+        if process.poll() is None:
+            time.sleep(0.02 * (attempt % 4))
+            os.killpg(process.pid, signal.SIGKILL)
+            kills += 1
+        code = process.wait()
+        if path.exists():
+            with h5py.File(path) as file:  # opens, and is consistent, whenever the kill came
+                seeds = file["episode/seed"][:].tolist()
+                assert seeds == [SPLITS["val"].seed(number) for number in range(len(seeds))]
+                assert len(file["frames"][:]) == file["episode/length"][:].sum()
+        if code == 0:
+            break
+    assert code == 0 and kills >= 3
+    assert contents(path) == contents(whole)
+    assert [item.name for item in tmp_path.iterdir()] == ["killed.h5"]  # no leftovers
+
+
+def progress(path: Path) -> tuple[str, ...]:
+    """Names of all that is on disk."""
+    return tuple(sorted(item.name for item in path.parent.rglob("*")))
+
+
+def test_another_configuration_is_refused(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r'was collected with .*"split": "val".* differs from .*"test"'):
+        collect(EpisodeConfig("test", image_size=16, render_stride=24), 20, whole)
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(ValueError, match="is not an episode file"):
+        collect(SMALL, 2, tmp_path / "text.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(ValueError, match="not an episode file; choose another --out"):
+        collect(SMALL, 2, tmp_path / "other.h5")
+
+
+def test_a_file_of_version_1_is_not_appended_to(whole: Path, tmp_path: Path) -> None:
+    old = shutil.copy(whole, tmp_path / "old.h5")
+    with h5py.File(old, "a") as file:
+        file.attrs["format_version"] = 1
+    with pytest.raises(ValueError, match="has format version 1, and version 2 cannot be appended"):
+        collect(SMALL, 20, old)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [({"episodes": 0}, "1 to 10000000"), ({"workers": 0}, "at least 1")]
+)
+def test_wrong_arguments_are_refused(arguments: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Args(**arguments)
+
+
+def test_the_command_line_collects_and_previews(tmp_path: Path) -> None:
+    def run(*arguments: str) -> str:
+        command = [sys.executable, "-m", "envs.collect", "--split", "test", "--image-size", "32", *arguments]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    out = tmp_path / "test.h5"
+    assert "2 episodes of split test" in run("--episodes", "2", "--out", str(out))
+    with h5py.File(out) as file:
+        assert len(file["episode/seed"]) == 2 and file["frames"].shape[1:] == (32, 32, 3)
+    run("--preview", "--episodes", "2", "--out", str(tmp_path / "sheet.png"))
+    sheet = iio.imread(tmp_path / "sheet.png")
+    assert sheet.shape == (2 * 132, 9 * 132, 3)
+    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
