@@ -94,14 +94,13 @@ class Grounding:
         """The things of one kind, sorted."""
         return tuple(sorted(thing for thing in self.things if thing.kind == kind))
 
-    @property
-    def instructions(self) -> tuple[Instruction, ...]:
-        """Every instruction that the scene allows, sorted."""
+    def instructions(self, *relations: str) -> tuple[Instruction, ...]:
+        """Every instruction of these relations (by default of all) that the scene allows, sorted."""
         every = [
             Instruction(name, thing, target)
-            for name, relation in RELATIONS.items()
-            for thing in self.of_kind(relation.kinds[0])
-            for target in self.of_kind(relation.kinds[1])
+            for name in relations or RELATIONS
+            for thing in self.of_kind(RELATIONS[name].kinds[0])
+            for target in self.of_kind(RELATIONS[name].kinds[1])
             if thing != target
         ]
         return tuple(sorted(every))

@@ -161,7 +161,7 @@ class BeamPlanner:
         wanted = unmet(parsed, grounding, goal) or goal.instructions
         allowed = _allowed(grounding, goal)
         if self.candidates == "goal":
-            allowed = [one for want in wanted for one in allowed if one.thing == want.thing]
+            allowed = tuple(one for want in wanted for one in allowed if one.thing == want.thing)
         depth = min(self.depth or len(wanted), len(wanted))
 
         branches, kept, starts = [_Branch()], [0], parsed
@@ -278,11 +278,11 @@ def _observe(
     return parsed, grounder(parsed).with_kinds(goal.things)
 
 
-def _allowed(grounding: Grounding, goal: Goal) -> list[Instruction]:
+def _allowed(grounding: Grounding, goal: Goal) -> tuple[Instruction, ...]:
     """The instructions that the scene allows, of the relations that the goal names."""
-    relations = {one.relation for one in goal.instructions}
-    allowed = [one for one in grounding.instructions if one.relation in relations]
+    relations = sorted({one.relation for one in goal.instructions})
+    allowed = grounding.instructions(*relations)
     if not allowed:
-        kinds = {kind: None for name in sorted(relations) for kind in RELATIONS[name].kinds}
+        kinds = dict.fromkeys(kind for name in relations for kind in RELATIONS[name].kinds)
         raise GroundingError(f"no {' or no '.join(kinds)} is seen")
     return allowed

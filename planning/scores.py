@@ -50,8 +50,8 @@ def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instructio
 def contents(masks_KHW: NDArray[np.bool_], grounding: Grounding) -> dict[Thing, set[Thing]]:
     """Which things are seen to lie in each target of the relation `in`, in the bool masks (K, H, W) of one frame."""
     inside: dict[Thing, set[Thing]] = {}
-    for one in grounding.instructions:
-        if one.relation == "in" and holds(masks_KHW, grounding, one):
+    for one in grounding.instructions("in"):
+        if holds(masks_KHW, grounding, one):
             inside.setdefault(one.target, set()).add(one.thing)
     return inside
 

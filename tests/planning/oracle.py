@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.colors import ARM_RGB, TABLE_RGB
 from envs.colors import COLORS as COLORS_255
+from envs.colors import TABLE_RGB
 from planning import Instruction, Palette, PinholeCamera
 from textocvp.renderer import Rendered, Renderer
 from textocvp.rollout import Rollout
@@ -27,7 +27,7 @@ LAYERS = {"block": BLOCK, "bowl": BOWL}
 BLOCK_SIZE, BOWL_RADIUS, BOWL_HEIGHT = 0.058, 0.069, 0.046
 HOME = np.array([0.34, 0.0, 0.13])
 
-PALETTE_INFO = {"colors": COLORS_255, "robot": ARM_RGB, "table": TABLE_RGB}  # as in `info["palette"]`
+PALETTE_INFO = {"colors": COLORS_255, "robot": (105, 72, 240), "table": TABLE_RGB}  # as in `info["palette"]`
 PALETTE = Palette.from_info(PALETTE_INFO)
 COLORS = PALETTE.colors
 

@@ -42,7 +42,7 @@ def test_every_thing_is_found_whatever_its_slot(
             torch.testing.assert_close(parsed.colors[0, 0, slots[0]], expected)
     assert [thing_.color for thing_ in grounding.of_kind("block")] == ["green", "red"]
     assert [thing_.color for thing_ in grounding.of_kind("bowl")] == ["blue", "gray", "white"]
-    assert len(grounding.instructions) == 6
+    assert len(grounding.instructions("in")) == 6
 
 
 def test_missing_things_are_named(oracle: OracleWorldModel, camera: PinholeCamera) -> None:

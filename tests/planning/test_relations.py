@@ -108,6 +108,8 @@ def test_one_trace_may_hold_several_relations(
     asked = [put_in("red", "blue"), beside, put_in("green", "gray")]
     rollout = oracle.rollout(parsed, [one.text for one in asked])
     grounding = grounder(parsed)
+    assert {one.relation for one in grounding.instructions()} == {"in", "beside"}
+    assert {one.relation for one in grounding.instructions("in")} == {"in"}
     together = measure_rollout(rollout, grounding, asked)
     assert together.within_B.tolist() == [4.0, 3.0, 4.0] and SuccessCriterion()(together).all()
     for row, one in enumerate(asked):

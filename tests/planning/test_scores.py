@@ -105,7 +105,7 @@ def test_measure_checks_shapes() -> None:
 def test_the_criterion_tells_the_instruction_from_every_other(oracle: OracleWorldModel, grounder) -> None:
     parsed = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
     grounding = grounder(parsed)
-    instructions = grounding.instructions
+    instructions = grounding.instructions("in")
     assert len(instructions) == 6
     rollout = oracle.rollout(parsed, [i.text for i in instructions])
     for wanted in instructions:
@@ -125,6 +125,6 @@ def test_the_criterion_tells_the_instruction_from_every_other(oracle: OracleWorl
 def test_a_robot_out_of_sight_holds_nothing(oracle: OracleWorldModel, grounder) -> None:
     parsed = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
     grounding = grounder(parsed)
-    rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions])
-    armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions)
+    rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions("in")])
+    armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions("in"))
     assert torch.isinf(armless.contact_Bt).all() and not SuccessCriterion()(armless).any()
