@@ -1,83 +1,87 @@
 """From imagined rollouts to robot actions: ground -> score -> plan -> act.
 
-    from planning import Controller, Goal, InstructionPlanner, PinholeCamera, run_episode
+    from planning import BeamPlanner, Goal, run_episode
 
     env = gym.make("PutBlockInBowl-v0", control="primitive")
-    world_model = WorldModel.from_pretrained()
-    planner = InstructionPlanner(world_model)
+    obs, info = env.reset(seed=0)
+    planner = BeamPlanner(WorldModel.from_pretrained())
     result = run_episode(env, planner, Goal.parse(obs["instruction"]), seed=0)
 
-Judging rollouts without a robot (the predicted study):
+Scoring rollouts without a robot:
 
-    camera = PinholeCamera.from_info(info["camera"])
-    instruction = Instruction.parse(text)                       # block colour, bowl colour
+    instruction = Instruction.parse(text)                            # relation, thing, target
     rollout = world_model.rollout(obs, [text] * n)
-    groundings = ground(rollout, camera)                             # one a rollout, or pass one for all
-    trace = measure_rollout(rollout, groundings, instruction)        # distances in pixels, (B, T)
-    success_B = Judge()(trace)
+    grounder = AppearanceGrounder.from_info(info)                    # camera and palette
+    trace = measure_rollout(rollout, grounder(rollout), instruction) # distances in pixels, (B, T)
+    success_B = SuccessCriterion()(trace)
 
-Nothing here reads the simulator's state, except `ground_privileged`, whose name says so.
+Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """
 
 from planning.camera import PinholeCamera
 from planning.controller import Controller, PickAndPlace
-from planning.goals import Goal, Instruction, Thing
-from planning.grounding import AppearanceGrounder, Grounding, GroundingError, ground
+from planning.grounding import (
+    AppearanceGrounder,
+    Grounder,
+    Grounding,
+    GroundingError,
+    Palette,
+    SegmentationGrounder,
+    ground,
+    ground_by_segmentation,
+)
+from planning.language import Goal, Instruction, Thing
 from planning.loop import Attempt, EpisodeResult, run_episode
-from planning.planners import Candidate, Imagines, InstructionPlanner, Plan, Planner, RandomPlanner
-from planning.privileged import PrivilegedGrounder, ground_privileged
-from planning.progress import goal_reached
-from planning.random_sequences import RandomSequencePlanner
+from planning.planners import BeamPlanner, Candidate, Imagines, Plan, Planner, RandomPlanner, watched_frames
+from planning.relations import RELATIONS, THRESHOLDS, Relation, Thresholds
 from planning.scores import (
     CarryScore,
-    Judge,
     PlacementScore,
     Score,
+    SuccessCriterion,
     Trace,
     WeightedSum,
-    arm_block_distance,
-    block_bowl_distance,
     measure,
     measure_rollout,
+    unmet,
 )
-from planning.sequences import SequencePlanner
-from planning.thresholds import THRESHOLDS, Thresholds
 
 __all__ = [
+    "RELATIONS",
     "THRESHOLDS",
     "AppearanceGrounder",
     "Attempt",
+    "BeamPlanner",
     "Candidate",
     "CarryScore",
     "Controller",
     "EpisodeResult",
     "Goal",
+    "Grounder",
     "Grounding",
     "GroundingError",
     "Imagines",
     "Instruction",
-    "InstructionPlanner",
-    "Judge",
+    "Palette",
     "PickAndPlace",
     "PinholeCamera",
     "PlacementScore",
     "Plan",
     "Planner",
-    "PrivilegedGrounder",
     "RandomPlanner",
-    "RandomSequencePlanner",
+    "Relation",
     "Score",
-    "SequencePlanner",
+    "SegmentationGrounder",
+    "SuccessCriterion",
     "Thing",
     "Thresholds",
     "Trace",
     "WeightedSum",
-    "arm_block_distance",
-    "block_bowl_distance",
-    "goal_reached",
     "ground",
-    "ground_privileged",
+    "ground_by_segmentation",
     "measure",
     "measure_rollout",
     "run_episode",
+    "unmet",
+    "watched_frames",
 ]

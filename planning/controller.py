@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
-from planning.goals import Instruction
-from planning.grounding import Grounding, hard_masks
+from planning.grounding import Grounding
+from planning.language import Instruction
+from planning.masks import hard_masks
+from planning.relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -31,44 +33,42 @@ class PickAndPlace:
 
 @dataclass(frozen=True)
 class Controller:
-    """Reads pick and place points off a rollout: where the block's slot starts, and where it ends.
+    """Reads pick and place points off a rollout: where the thing's slot starts, and where it ends.
 
-    The heights are those of a block's middle, on the table and on a bowl's floor. On the true masks of 100
-    val scenes they put the pick at most 2.6 mm and the place at most 3.3 mm off (`experiments/calibrate.py`).
+    The heights are those of a block's middle, on the table (here) and on a bowl's floor (`Relation.place_height`).
+    On the true masks of 100 val scenes they put the pick at most 2.6 mm and the place at most 3.3 mm off
+    (`experiments/calibrate.py`).
 
     Attributes:
         camera: of the scene.
-        pick_height: height above the table, in metres, of the point that a block's slot is centred on when it
-            stands.
-        place_height: the same when it lies in a bowl.
+        pick_height: height above the table, in metres, of the point that a thing's slot is centred on when it
+            stands there.
     """
 
     camera: PinholeCamera
     pick_height: float = 0.029
-    place_height: float = 0.036
 
     def act(self, rollout: Rollout, grounding: Grounding, instruction: Instruction) -> PickAndPlace:
         """The action that makes an imagined rollout (B = 1) real.
 
         Args:
-            instruction: the one that was imagined; its block is the one that moves.
+            instruction: the one that was imagined; its thing is the one that moves.
 
         Raises:
-            GroundingError: if the block is not in the grounding.
+            GroundingError: if the thing is not in the grounding.
             ValueError: if the camera's ray through one of the points does not meet the table.
         """
-        slots = list(grounding.find(instruction.block_thing))
+        slots = grounding.slots_of(instruction.thing)
         start, end = (slot_center(rollout, slots, frame) for frame in (0, rollout.slots.shape[1] - 1))
         pick = self.camera.unproject_to_plane(start, self.pick_height)
-        place = self.camera.unproject_to_plane(end, self.place_height)
+        place = self.camera.unproject_to_plane(end, RELATIONS[instruction.relation].place_height)
         return PickAndPlace((float(pick[0]), float(pick[1])), (float(place[0]), float(place[1])))
 
 
 def slot_center(rollout: Rollout, slots: Sequence[int], frame: int) -> NDArray[np.float64]:
     """Where an object is in one frame of a rollout (B = 1): (x, y) in pixels.
 
-    The slot's own position; for an object of several slots their mean, weighted by the pixels each of them
-    wins.
+    The slot's own position; for several slots their mean, weighted by the pixels that each of them wins.
     """
     positions_k2 = rollout.positions[0, frame, list(slots)].double().cpu().numpy()
     if len(slots) == 1:

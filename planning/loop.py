@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
 from planning.controller import Controller, PickAndPlace
-from planning.goals import Goal, Instruction
 from planning.grounding import AppearanceGrounder, Grounder, GroundingError
+from planning.language import Goal, Instruction
 from planning.planners import Plan, Planner
-from planning.privileged import PrivilegedGrounder
-from planning.progress import goal_reached
+from planning.scores import unmet
 
 if TYPE_CHECKING:
     import gymnasium
@@ -51,13 +50,12 @@ class EpisodeResult:
 
     Attributes:
         success: the simulator's verdict after the last action.
-        gained: by how much the share of the goal's pairs that hold rose, by the environment's rewards: 1 where none
-            held at the start and all do at the end.
+        gained: by how much the share of the goal that holds rose, by the environment's rewards: 1 where nothing of it
+            held at the start and all does at the end.
         believes_reached: the planner's own verdict at that moment.
         attempts: the turns of the loop; empty if the scene could not be grounded.
         error: why the loop gave up, or None.
-        frames: (T, H, W, 3) what the camera saw, first observation included (with `record_frames`, all of
-            it).
+        frames: (T, H, W, 3) what the camera saw, first observation included (with `record_frames`, all of it).
     """
 
     success: bool
@@ -83,26 +81,29 @@ def run_episode(
     planner: Planner,
     goal: Goal | None = None,
     *,
+    ground: Callable[[Mapping[str, Any]], Grounder] = AppearanceGrounder.from_info,
+    controller: Callable[[PinholeCamera], Controller] = Controller,
     seed: int | None = None,
     options: Mapping[str, Any] | None = None,
     max_attempts: int = 3,
     replan: bool = True,
-    privileged: bool = False,
 ) -> EpisodeResult:
     """Reset a `control="primitive"` environment and pursue a goal in it.
 
-    From `info` the planner is given the camera only. Reward, `terminated` and `is_success`, by which the simulator
-    tells success, are read for the result and nothing else: whoever does not see that the goal is reached goes on, and
-    may undo it.
+    The planner sees pictures and what `ground` and `controller` take of `info`: by default camera and palette. Reward,
+    `terminated` and `is_success`, by which the simulator tells success, are read for the result and nothing else:
+    whoever does not see that the goal is reached goes on, and may undo it.
 
     Args:
         goal: by default what the environment's instruction says.
-        seed, options: for `env.reset`; for a variant of a scene pass `options={"instruction": ...}`, so that
-            the simulator judges the goal that is pursued.
-        max_attempts: pick-and-places at most (per pair of the goal).
-        replan: look again after each action, and plan anew while the goal is not reached. Otherwise one plan
-            is made and carried out to its end.
-        privileged: ground with the simulator's segmentation instead (the control column of that name).
+        ground: makes a grounder for each observation, of its `info`. `SegmentationGrounder.from_info` reads the
+            simulator's truth instead (the control column `privileged`).
+        controller: makes the controller, of the scene's camera.
+        seed, options: for `env.reset`; for a variant of a scene pass `options={"instruction": ...}`, so that the
+            simulator judges the goal that is pursued.
+        max_attempts: pick-and-places at most (per instruction of the goal).
+        replan: look again after each action, and plan anew while the goal is not reached. Otherwise one plan is made
+            and carried out to its end.
 
     Raises:
         ValueError: if the environment is not in `primitive` control.
@@ -115,19 +116,18 @@ def run_episode(
     observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
     rgb = observation["rgb"]
     goal = Goal.parse(info["instruction"]) if goal is None else goal
-    camera = PinholeCamera.from_info(info["camera"])
-    controller = Controller(camera)
+    robot = controller(PinholeCamera.from_info(info["camera"]))
     frames: list[NDArray[np.uint8]] = [rgb[None]]
     attempts: list[Attempt] = []
     queue: list[tuple[Instruction, Rollout]] = []
     reached, gained, error = False, 0.0, None
-    for _ in range(max_attempts * len(goal.pairs)):
+    for _ in range(max_attempts * len(goal.instructions)):
         try:
             if not queue:
-                plan = planner.plan(rgb, goal, _grounder(info, camera, privileged))
+                plan = planner.plan(rgb, goal, ground(info))
                 queue = list(zip(plan.best.instructions, plan.rollouts, strict=True))
             instruction, rollout = queue.pop(0)
-            action = controller.act(rollout, plan.grounding, instruction)
+            action = robot.act(rollout, plan.grounding, instruction)
         except GroundingError as problem:
             error = str(problem)
             break
@@ -136,7 +136,7 @@ def run_episode(
         observation, reward, _, truncated, info = env.step(within_reach)
         rgb, gained = observation["rgb"], gained + float(reward)
         frames.append(_frames(info, rgb))
-        reached = _looks_reached(planner, rgb, goal, _grounder(info, camera, privileged))
+        reached = _looks_reached(planner, rgb, goal, ground(info))
         attempts.append(Attempt(seen, plan, instruction, rollout, action, reached))
         if replan:
             queue = []
@@ -152,16 +152,10 @@ def run_episode(
     )
 
 
-def _grounder(info: Mapping[str, Any], camera: PinholeCamera, privileged: bool) -> Grounder:
-    if privileged:
-        return PrivilegedGrounder(info["segmentation"], info["objects"])
-    return AppearanceGrounder(camera)
-
-
 def _looks_reached(planner: Planner, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> bool:
     parsed = planner.world_model.parse(rgb[None])
     try:
-        return goal_reached(parsed, grounder(parsed).told(goal.things), goal)
+        return not unmet(parsed, grounder(parsed).with_kinds(goal.things), goal)
     except GroundingError:  # what cannot be seen is not known to be reached
         return False
 

@@ -8,19 +8,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from planning.goals import Goal, Instruction
 from planning.grounding import Grounder, Grounding, GroundingError
-from planning.progress import open_pairs
-from planning.scores import CarryScore, Judge, PlacementScore, Score, WeightedSum, measure_rollout
+from planning.language import Goal, Instruction
+from planning.masks import hard_masks
+from planning.relations import RELATIONS
+from planning.scores import (
+    DEFAULT_CRITERION,
+    DEFAULT_SCORE,
+    Score,
+    SuccessCriterion,
+    Trace,
+    contents,
+    measure_rollout,
+    unmet,
+)
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
+
+_T = TypeVar("_T")
 
 
 class Imagines(Protocol):
@@ -31,9 +43,7 @@ class Imagines(Protocol):
         ...
 
     def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
-        """Imagine one scene (B = 1, its last frame) under n texts, or n scenes under n texts: a batch of
-        n.
-        """
+        """Imagine one scene (B = 1, its last frame) under n texts, or n scenes under n texts: a batch of n."""
         ...
 
 
@@ -44,7 +54,7 @@ class Candidate:
     Attributes:
         instructions: what would be done, in order.
         score: of the goal at its imagined end, higher is better.
-        reaches_goal: whether the judge says so of the imagined rollouts.
+        reaches_goal: whether the criterion says so of the imagined rollouts.
     """
 
     instructions: tuple[Instruction, ...]
@@ -93,80 +103,186 @@ class Planner(Protocol):
         """A plan for the goal from one observation (H, W, 3).
 
         Raises:
-            GroundingError: if no block or no bowl of the goal can be found in the picture.
+            GroundingError: if what the plan is made of cannot be found in the picture.
         """
         ...
 
 
 def watched_frames(length: int, settle: int, stride: int) -> tuple[int, ...]:
-    """The frames a planner decodes: every `stride`-th, and the last `settle` of `length` frames without a
-    gap.
-    """
+    """The frames to decode: every `stride`-th, and the last `settle` of `length` frames without a gap."""
     return tuple(t for t in range(length) if t % stride == 0 or t >= length - settle)
 
 
-@dataclass
-class InstructionPlanner:
-    """Imagines every block x bowl instruction of the scene as one batch and takes the one that best reaches
-    the goal.
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """A sequence under search, and where each instruction of it was imagined (batch and row in it)."""
 
-    With a goal of several pairs it takes the best next step: the best score over the pairs not reached yet.
+    instructions: tuple[Instruction, ...] = ()
+    imagined: tuple[tuple[Rollout, int], ...] = ()
+
+
+@dataclass
+class BeamPlanner:
+    """Beam search over sequences of instructions.
+
+    Each step is imagined from where the last imagined one ended; all candidates of a step are one batch. A sequence of
+    n instructions is worth the mean of its n best scores, one for each instruction of the goal that does not hold yet,
+    over its whole imagined course. A sequence moves each thing once.
 
     Attributes:
         world_model: imagines.
-        score: ranks the imagined rollouts against a pair of the goal.
-        judge: says whether a rollout reaches it.
-        horizon: frames to imagine.
-        stride: of the frames during the carry, every how many are decoded and scored (the last ones always
-            are).
+        score: ranks a course against one instruction of the goal.
+        criterion: says whether it fulfils that instruction.
+        depth: instructions in a plan; None plans for as many as do not hold yet, which is also the most.
+        candidates: what a step may be: any instruction of the `scene`, or those that move a thing of the `goal`.
+        one_block_per_bowl: leave out steps into a bowl in which another block is seen to lie by then: a model that has
+            never seen two blocks meet in a bowl imagines that both fit.
+        beam: how many sequences are kept after each step; 0 keeps all (exhaustive).
+        horizon: frames to imagine for each step.
+        stride: of the frames during a carry, every how many are decoded and scored (the last ones always are).
         seed: of the slot sampling.
     """
 
     world_model: Imagines
-    score: Score = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))
-    judge: Judge = Judge()
+    score: Score = DEFAULT_SCORE
+    criterion: SuccessCriterion = DEFAULT_CRITERION
+    depth: int | None = None
+    candidates: Literal["goal", "scene"] = "goal"
+    one_block_per_bowl: bool = True
+    beam: int = 4
     horizon: int = 24
     stride: int = 3
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
-        """A plan of one instruction; see `Planner.plan`."""
+        """The best sequence; see `Planner.plan`."""
         began = perf_counter()
-        parsed = self.world_model.parse(rgb[None], seed=self.seed)
-        grounding = grounder(parsed).told(goal.things)
-        pairs = open_pairs(parsed, grounding, goal) or goal.pairs
-        instructions = grounding.instructions
-        texts = [instruction.text for instruction in instructions]
-        rollout = self.world_model.rollout(parsed, texts, horizon=self.horizon, seed=self.seed)
-        frames = watched_frames(rollout.slots.shape[1], self.judge.thresholds.settle_frames, self.stride)
-        traces = [measure_rollout(rollout, grounding, pair, frames=frames) for pair in pairs]
-        score_B = torch.stack([self.score(trace) for trace in traces]).amax(0)
-        reaches_B = torch.stack([self.judge(trace) for trace in traces]).any(0)
-        order = score_B.argsort(descending=True, stable=True).tolist()
-        ranking = tuple(Candidate((instructions[i],), float(score_B[i]), bool(reaches_B[i])) for i in order)
-        return Plan(ranking, (rollout.select(order[0]),), grounding, perf_counter() - began)
+        parsed, grounding = _observe(self.world_model, rgb, goal, grounder, self.seed)
+        wanted = unmet(parsed, grounding, goal) or goal.instructions
+        allowed = _allowed(grounding, goal)
+        if self.candidates == "goal":
+            allowed = tuple(one for want in wanted for one in allowed if one.thing == want.thing)
+        depth = min(self.depth or len(wanted), len(wanted))
+
+        branches, kept, starts = [_Branch()], [0], parsed
+        traces: list[Trace] = []
+        for done in range(depth):
+            steps = self._steps([branches[i] for i in kept], allowed, starts, grounding)
+            rows, texts = [row for row, _ in steps], [one.text for _, one in steps]
+            starts = starts.select(rows)
+            rollout = self.world_model.rollout(starts, texts, horizon=self.horizon, seed=self.seed)
+            length = rollout.slots.shape[1]
+            frames = watched_frames(length, self.criterion.thresholds.settle_frames, self.stride)
+            new = [measure_rollout(rollout, grounding, want, frames=frames) for want in wanted]
+            if done:
+                before = [trace.select([kept[row] for row in rows]) for trace in traces]
+                new = [old.then(trace, done * length) for old, trace in zip(before, new, strict=True)]
+            traces = new
+            parents = [branches[kept[row]] for row in rows]
+            branches = [
+                _Branch((*parent.instructions, one), (*parent.imagined, (rollout, i)))
+                for i, (parent, (_, one)) in enumerate(zip(parents, steps, strict=True))
+            ]
+            scores = self._scores(traces, depth)
+            ranked = sorted(range(len(steps)), key=lambda i: scores[i], reverse=True)
+            kept = ranked[: self.beam] if self.beam else ranked
+            starts = rollout.last.select(kept)
+
+        reaches_B = torch.stack([self.criterion(trace) for trace in traces]).sum(0) >= depth
+        ranking = tuple(Candidate(branches[i].instructions, scores[i], bool(reaches_B[i])) for i in ranked)
+        rollouts = tuple(batch.select(row) for batch, row in branches[ranked[0]].imagined)
+        return Plan(ranking, rollouts, grounding, perf_counter() - began)
+
+    def _steps(
+        self, kept: Sequence[_Branch], allowed: Sequence[Instruction], starts: Rollout, grounding: Grounding
+    ) -> list[tuple[int, Instruction]]:
+        """What may come next: the row of `starts` and of `kept`, and an instruction."""
+        steps = [
+            (row, one)
+            for row, branch in enumerate(kept)
+            for one in allowed
+            if one.thing not in {done.thing for done in branch.instructions}
+        ]
+        if not self.one_block_per_bowl:
+            return steps
+        masks_BKHW = hard_masks(starts.decode_masks([-1])[:, 0]).cpu().numpy()
+        inside = [contents(masks_KHW, grounding) for masks_KHW in masks_BKHW]
+        free = [(row, one) for row, one in steps if inside[row].get(one.target, set()) <= {one.thing}]
+        return free or steps  # should no bowl have room, trying is better than giving up
+
+    def _scores(self, traces: Sequence[Trace], count: int) -> list[float]:
+        """One score a sequence: the mean over the `count` instructions of the goal that it fulfils best."""
+        scores_Bn = torch.stack([self.score(trace) for trace in traces], dim=1).tolist()
+        if count < len(traces):
+            scores_Bn = [sorted(scores_n, reverse=True)[:count] for scores_n in scores_Bn]
+        return [sum(scores_n) / count for scores_n in scores_Bn]
 
 
 @dataclass
 class RandomPlanner:
-    """The control row: a random block x bowl instruction of the scene, imagined only to be carried out."""
+    """The control row: random instructions, imagined only to be carried out.
+
+    Attributes:
+        world_model: imagines.
+        rng: the source of chance.
+        depth: instructions in a plan; None plans for as many of the goal's as do not hold yet, which is also the most.
+        from_goal: take the goal's own instructions, so that only their order is left to chance. Otherwise a plan of
+            depth 1 is any instruction of the scene, and in a longer one no thing and no target comes twice.
+        horizon: frames to imagine for each step.
+        seed: of the slot sampling.
+    """
 
     world_model: Imagines
     rng: np.random.Generator
+    depth: int | None = None
+    from_goal: bool = False
     horizon: int = 24
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
-        """A random instruction; the rest of the ranking is in random order too."""
+        """A random sequence. With depth 1 the rest of the ranking is the rest of the instructions, in random order."""
         began = perf_counter()
-        parsed = self.world_model.parse(rgb[None], seed=self.seed)
-        grounding = grounder(parsed).told(goal.things)
-        if not grounding.instructions:
-            raise GroundingError("no block or no bowl is seen")
-        shuffled = self.rng.permutation(len(grounding.instructions)).tolist()
-        instructions = [grounding.instructions[i] for i in shuffled]
-        rollout = self.world_model.rollout(
-            parsed, [instructions[0].text], horizon=self.horizon, seed=self.seed
+        parsed, grounding = _observe(self.world_model, rgb, goal, grounder, self.seed)
+        sequences = self._draw(parsed, grounding, goal)
+        rollouts, start = [], parsed
+        for one in sequences[0]:
+            rollouts.append(self.world_model.rollout(start, [one.text], horizon=self.horizon, seed=self.seed))
+            start = rollouts[-1].last
+        ranking = tuple(Candidate(sequence, 0.0, False) for sequence in sequences)
+        return Plan(ranking, tuple(rollouts), grounding, perf_counter() - began)
+
+    def _draw(self, parsed: Rollout, grounding: Grounding, goal: Goal) -> list[tuple[Instruction, ...]]:
+        if self.depth == 1 and not self.from_goal:  # what the goal names need not even be seen
+            return [(one,) for one in self._shuffled(_allowed(grounding, goal))]
+        wanted = unmet(parsed, grounding, goal) or goal.instructions
+        depth = min(self.depth or len(wanted), len(wanted))
+        if self.from_goal:
+            return [tuple(self._shuffled(wanted)[:depth])]
+        allowed = _allowed(grounding, goal)
+        things, targets = (
+            self._shuffled(sorted({one.things[role] for one in allowed}))[:depth] for role in (0, 1)
         )
-        ranking = tuple(Candidate((instruction,), 0.0, False) for instruction in instructions)
-        return Plan(ranking, (rollout,), grounding, perf_counter() - began)
+        by_things = {one.things: one for one in allowed}
+        drawn = [by_things[pair] for pair in zip(things, targets, strict=False) if pair in by_things]
+        return [tuple(drawn or self._shuffled(allowed)[:1])]
+
+    def _shuffled(self, values: Sequence[_T]) -> list[_T]:
+        return [values[i] for i in self.rng.permutation(len(values))]
+
+
+def _observe(
+    world_model: Imagines, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder, seed: int
+) -> tuple[Rollout, Grounding]:
+    """A picture (H, W, 3), parsed and grounded; the goal's sentence says of what kind its things are."""
+    parsed = world_model.parse(rgb[None], seed=seed)
+    return parsed, grounder(parsed).with_kinds(goal.things)
+
+
+def _allowed(grounding: Grounding, goal: Goal) -> tuple[Instruction, ...]:
+    """The instructions that the scene allows, of the relations that the goal names."""
+    relations = sorted({one.relation for one in goal.instructions})
+    allowed = grounding.instructions(*relations)
+    if not allowed:
+        kinds = dict.fromkeys(kind for name in relations for kind in RELATIONS[name].kinds)
+        raise GroundingError(f"no {' or no '.join(kinds)} is seen")
+    return allowed

@@ -1,8 +1,8 @@
-"""From masks to distances, and from distances to success and scores.
+"""What masks say: whether instructions hold in a frame, and how well a rollout fulfils them.
 
-`measure` turns the masks of arm, block and bowl into a `Trace` of two distances a frame. Everything else
-reads a `Trace`: the `Judge` says whether the instruction was carried out, a `Score` ranks candidates. Scores
-compose, and none of them knows where the masks came from.
+`unmet` looks at one frame. `measure` turns the masks of a rollout into a `Trace` of two distances a frame. Everything
+else reads a `Trace`: `SuccessCriterion` says whether the instruction was carried out, a `Score` ranks candidates.
+Scores compose, and none of them knows where the masks came from, or which relation they measure.
 """
 
 from __future__ import annotations
@@ -11,17 +11,49 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from planning.goals import Instruction
 from planning.grounding import Grounding
-from planning.thresholds import THRESHOLDS, Thresholds
+from planning.language import Goal, Instruction, Thing
+from planning.masks import contact_distance, hard_masks
+from planning.relations import RELATIONS, THRESHOLDS, Thresholds
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
-UNSEEN = float("inf")  # the distance to something that no pixel shows
+
+def holds(masks_KHW: NDArray[np.bool_], grounding: Grounding, instruction: Instruction) -> bool:
+    """Whether the bool masks (K, H, W) of one frame show what an instruction asks for.
+
+    Raises:
+        GroundingError: if the grounding lacks its thing or target.
+    """
+    thing_HW, target_HW = (
+        np.any(masks_KHW[list(grounding.slots_of(one))], axis=0) for one in instruction.things
+    )
+    return RELATIONS[instruction.relation].holds(thing_HW, target_HW)
+
+
+def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instruction, ...]:
+    """The instructions of a goal that do not hold in the first frame of a parsed observation (B = 1).
+
+    Raises:
+        GroundingError: if a thing of the goal is not seen.
+    """
+    masks_KHW = hard_masks(parsed.decode_masks([0])[0, 0]).cpu().numpy()
+    return tuple(one for one in goal.instructions if not holds(masks_KHW, grounding, one))
+
+
+def contents(masks_KHW: NDArray[np.bool_], grounding: Grounding) -> dict[Thing, set[Thing]]:
+    """Which things are seen to lie in each target of the relation `in`, in the bool masks (K, H, W) of one frame."""
+    inside: dict[Thing, set[Thing]] = {}
+    for one in grounding.instructions("in"):
+        if holds(masks_KHW, grounding, one):
+            inside.setdefault(one.target, set()).add(one.thing)
+    return inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,34 +62,37 @@ class Trace:
 
     Attributes:
         frames: (t,) increasing indices of those frames in the rollout.
-        arm_block_Bt: smallest distance between a pixel of the arm and a pixel of the block, in pixels; inf in
+        contact_Bt: smallest distance between a pixel of the arm and a pixel of the thing, in pixels; inf in
             frames where one of them is not seen.
-        block_bowl_Bt: distance between the centroids of block and bowl, in pixels; inf as above.
+        distance_Bt: how far thing and target are from the relation (`Relation.distance`), in pixels; inf as above.
+        within_B: up to which distance the relation is fulfilled (`Relation.within_px`), in pixels.
     """
 
     frames: tuple[int, ...]
-    arm_block_Bt: Tensor
-    block_bowl_Bt: Tensor
+    contact_Bt: Tensor
+    distance_Bt: Tensor
+    within_B: Tensor
 
     def then(self, later: Trace, length: int) -> Trace:
         """This trace and a later one that starts where this one's rollout of `length` frames ends."""
         return Trace(
             self.frames + tuple(length + frame for frame in later.frames),
-            torch.cat([self.arm_block_Bt, later.arm_block_Bt], dim=1),
-            torch.cat([self.block_bowl_Bt, later.block_bowl_Bt], dim=1),
+            torch.cat([self.contact_Bt, later.contact_Bt], dim=1),
+            torch.cat([self.distance_Bt, later.distance_Bt], dim=1),
+            self.within_B,
         )
 
     def select(self, index: Sequence[int]) -> Trace:
         """The trace of some of the rollouts."""
         keep = list(index)
-        return Trace(self.frames, self.arm_block_Bt[keep], self.block_bowl_Bt[keep])
+        return Trace(self.frames, self.contact_Bt[keep], self.distance_Bt[keep], self.within_B[keep])
 
-    def held(self, within: float) -> Tensor:
-        """The longest unbroken run with the arm at most `within` pixels from the block, (B,) in frames.
+    def longest_contact(self, within: float) -> Tensor:
+        """The longest unbroken run with the arm at most `within` pixels from the thing, (B,) in frames.
 
-        Between two looked-at neighbours that both hold, the frames skipped are taken to hold as well.
+        Between two looked-at neighbours that both touch, the frames skipped are taken to touch as well.
         """
-        near_Bt = self.arm_block_Bt <= within
+        near_Bt = self.contact_Bt <= within
         longest_B = torch.zeros(near_Bt.shape[0])
         start_B = torch.zeros(near_Bt.shape[0])
         for i, frame in enumerate(self.frames):
@@ -67,79 +102,36 @@ class Trace:
         return longest_B
 
 
-def arm_block_distance(arm_NHW: Tensor, block_NHW: Tensor) -> Tensor:
-    """Smallest distance between a pixel of one mask and a pixel of the other.
-
-    Args:
-        arm_NHW, block_NHW: bool masks (..., H, W).
-
-    Returns:
-        (...) in pixels, exact: 0 where they overlap, 1 for neighbours, inf where one is empty.
-    """
-    lead, size = arm_NHW.shape[:-2], arm_NHW.shape[-2:]
-    arm_NHW, block_NHW = arm_NHW.reshape(-1, *size), block_NHW.reshape(-1, *size)
-    # Two disjoint shapes are nearest to each other at their outlines, which are few pixels.
-    arm_NP2, block_NQ2 = outline_points(arm_NHW, UNSEEN), outline_points(block_NHW, -UNSEEN)
-    gap_N = torch.full((len(arm_NHW),), UNSEEN)
-    if arm_NP2.shape[1] and block_NQ2.shape[1]:
-        rows_NPQ, columns_NPQ = (arm_NP2[:, :, None, i] - block_NQ2[:, None, :, i] for i in (0, 1))
-        gap_N = (rows_NPQ.square_() + columns_NPQ.square_()).flatten(1).amin(1).sqrt()
-    overlap_N = (arm_NHW & block_NHW).flatten(1).any(1)
-    return gap_N.masked_fill(overlap_N, 0.0).reshape(lead)
-
-
-def outline_points(masks_NHW: Tensor, filler: float) -> Tensor:
-    """Rows and columns (N, P, 2) of those pixels of bool masks (N, H, W) that have a neighbour outside.
-
-    P is what the longest outline needs; shorter ones are filled up with `filler`.
-    """
-    inner_NHW = masks_NHW.clone()
-    inner_NHW[:, [0, -1]], inner_NHW[:, :, [0, -1]] = False, False
-    inner_NHW[:, 1:-1, 1:-1] &= masks_NHW[:, 2:, 1:-1] & masks_NHW[:, :-2, 1:-1]
-    inner_NHW[:, 1:-1, 1:-1] &= masks_NHW[:, 1:-1, 2:] & masks_NHW[:, 1:-1, :-2]
-    n, y, x = (masks_NHW & ~inner_NHW).nonzero(as_tuple=True)
-    count_N = torch.bincount(n, minlength=len(masks_NHW))
-    place = torch.arange(len(n)) - (count_N.cumsum(0) - count_N)[n]
-    points_NP2 = torch.full((len(masks_NHW), int(count_N.max()) if len(count_N) else 0, 2), filler)
-    points_NP2[n, place] = torch.stack([y, x], dim=1).float()
-    return points_NP2
-
-
-def centroids(masks_NHW: Tensor) -> Tensor:
-    """Centres of mass (x, y) of masks (..., H, W), in pixels, (..., 2); NaN for an empty mask."""
-    height, width = masks_NHW.shape[-2:]
-    masks_NHW = masks_NHW.float()
-    area_N = masks_NHW.sum((-2, -1))
-    x_N = (masks_NHW.sum(-2) * (torch.arange(width) + 0.5)).sum(-1) / area_N
-    y_N = (masks_NHW.sum(-1) * (torch.arange(height) + 0.5)).sum(-1) / area_N
-    return torch.stack([x_N, y_N], dim=-1)
-
-
-def block_bowl_distance(block_NHW: Tensor, bowl_NHW: Tensor) -> Tensor:
-    """Distance (...) between the centroids of two bool masks (..., H, W), in pixels; inf if one is empty."""
-    return (centroids(block_NHW) - centroids(bowl_NHW)).norm(dim=-1).nan_to_num(nan=UNSEEN)
-
-
 def measure(
-    arm_BtHW: Tensor, block_BtHW: Tensor, bowl_BtHW: Tensor, frames: Sequence[int] | None = None
+    arm_BtHW: Tensor,
+    thing_BtHW: Tensor,
+    target_BtHW: Tensor,
+    relations: Sequence[str],
+    frames: Sequence[int] | None = None,
 ) -> Trace:
-    """The trace of B clips whose bool masks (B, t, H, W) of arm, block and bowl are given.
+    """The trace of B clips whose bool masks (B, t, H, W) of arm, thing and target are given.
 
     Args:
+        relations: B keys of `RELATIONS`.
         frames: which frames of the rollout the t masks show; by default 0..t-1.
 
     Raises:
         ValueError: if the shapes differ or are not (B, t, H, W).
     """
-    if not (arm_BtHW.shape == block_BtHW.shape == bowl_BtHW.shape) or arm_BtHW.ndim != 4:
+    if not (arm_BtHW.shape == thing_BtHW.shape == target_BtHW.shape) or arm_BtHW.ndim != 4:
         raise ValueError(
             f"masks must share one shape (B, t, H, W), got arm {tuple(arm_BtHW.shape)}, "
-            f"block {tuple(block_BtHW.shape)}, bowl {tuple(bowl_BtHW.shape)}"
+            f"thing {tuple(thing_BtHW.shape)}, target {tuple(target_BtHW.shape)}"
         )
+    distance_Bt = torch.empty(arm_BtHW.shape[:2])
+    for name in set(relations):
+        rows = [row for row, other in enumerate(relations) if other == name]
+        distance_Bt[rows] = RELATIONS[name].distance(thing_BtHW[rows], target_BtHW[rows])
     return Trace(
         tuple(range(arm_BtHW.shape[1]) if frames is None else frames),
-        arm_block_distance(arm_BtHW, block_BtHW),
-        block_bowl_distance(block_BtHW, bowl_BtHW),
+        contact_distance(arm_BtHW, thing_BtHW),
+        distance_Bt,
+        torch.tensor([RELATIONS[name].within_px for name in relations]),
     )
 
 
@@ -154,12 +146,12 @@ def measure_rollout(
 
     Args:
         groundings: which slot is what; one for all B rollouts, or one each.
-        instructions: whose block and bowl to watch; one for all, or one each.
+        instructions: whose thing and target to watch; one for all, or one each.
         frames: the frames to decode masks of; by default all.
 
     Raises:
         ValueError: if there is neither one grounding (instruction) nor B.
-        GroundingError: if a grounding does not have the block or bowl.
+        GroundingError: if a grounding does not have the thing or target.
     """
     batch, length = rollout.slots.shape[:2]
     each_grounding = [groundings] * batch if isinstance(groundings, Grounding) else list(groundings)
@@ -183,19 +175,19 @@ def measure_rollout(
     both = list(zip(each_grounding, each_instruction, strict=True))
     return measure(
         union([grounding.arm for grounding in each_grounding]),
-        union([grounding.find(instruction.block_thing) for grounding, instruction in both]),
-        union([grounding.find(instruction.bowl_thing) for grounding, instruction in both]),
+        union([grounding.slots_of(instruction.thing) for grounding, instruction in both]),
+        union([grounding.slots_of(instruction.target) for grounding, instruction in both]),
+        [instruction.relation for instruction in each_instruction],
         frames,
     )
 
 
 @dataclass(frozen=True)
-class Judge:
+class SuccessCriterion:
     """Says of each rollout of a trace whether the instruction was carried out.
 
-    The criterion of the paper's controllability study (section 4.4): the arm stays at the named block for
-    some frames in a row, and the block ends in the named bowl. Look at every frame for the criterion as
-    calibrated.
+    The criterion of the paper's controllability study (section 4.4): the arm stays at the named thing for some frames
+    in a row, and the thing ends as asked for. Look at every frame for the criterion as calibrated.
     """
 
     thresholds: Thresholds = THRESHOLDS
@@ -203,8 +195,8 @@ class Judge:
     def __call__(self, trace: Trace) -> Tensor:
         """Success, (B,) bool."""
         limits = self.thresholds
-        settled_Bt = trace.block_bowl_Bt[:, -limits.settle_frames :] <= limits.block_bowl_px
-        return (trace.held(limits.arm_block_px) >= limits.hold_frames) & settled_Bt.all(1)
+        settled_Bt = trace.distance_Bt[:, -limits.settle_frames :] <= trace.within_B[:, None]
+        return (trace.longest_contact(limits.contact_px) >= limits.contact_frames) & settled_Bt.all(1)
 
 
 class Score(Protocol):
@@ -217,25 +209,26 @@ class Score(Protocol):
 
 @dataclass(frozen=True)
 class PlacementScore:
-    """How near the bowl the block ends: 1 at its centre, 0 at the limit of success, negative beyond."""
+    """How near the relation is at the end: 1 at distance 0, 0 at the limit of success, negative beyond."""
 
     thresholds: Thresholds = THRESHOLDS
     floor: float = -10.0
 
     def __call__(self, trace: Trace) -> Tensor:
         """The mean over the last `settle_frames` looked-at frames, (B,)."""
-        distance_Bt = trace.block_bowl_Bt[:, -self.thresholds.settle_frames :]
-        return (1 - distance_Bt.mean(1) / self.thresholds.block_bowl_px).clamp(min=self.floor)
+        distance_Bt = trace.distance_Bt[:, -self.thresholds.settle_frames :]
+        return (1 - distance_Bt.mean(1) / trace.within_B).clamp(min=self.floor)
 
 
 @dataclass(frozen=True)
 class CarryScore:
-    """How long the arm holds the block, as a share of `hold_frames`, at most 1."""
+    """How long the arm holds the thing, as a share of `contact_frames`, at most 1."""
 
     thresholds: Thresholds = THRESHOLDS
 
     def __call__(self, trace: Trace) -> Tensor:
-        return (trace.held(self.thresholds.arm_block_px) / self.thresholds.hold_frames).clamp(max=1)
+        limits = self.thresholds
+        return (trace.longest_contact(limits.contact_px) / limits.contact_frames).clamp(max=1)
 
 
 @dataclass(frozen=True)
@@ -254,3 +247,8 @@ class WeightedSum:
     def __call__(self, trace: Trace) -> Tensor:
         parts = [weight * score(trace) for score, weight in zip(self.scores, self.weights, strict=True)]
         return torch.stack(parts).sum(0) / sum(self.weights)
+
+
+#: What planners use unless told otherwise.
+DEFAULT_CRITERION = SuccessCriterion()
+DEFAULT_SCORE = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))

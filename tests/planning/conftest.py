@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 
-from envs.camera import PRESETS, Camera
-from planning import PinholeCamera
-from tests.planning.oracle import OracleWorldModel
+from envs.physics.camera import PRESETS, Camera
+from planning import AppearanceGrounder, Instruction, PinholeCamera, Thing
+from tests.planning.oracle import PALETTE, OracleWorldModel
 
 torch.set_num_threads(1)  # tiny tensors: more threads only wait for each other
 
@@ -19,10 +19,20 @@ def thing(kind: str, color: str, x: float, y: float) -> dict[str, Any]:
     return {"kind": kind, "color": color, "position": (x, y, 0.029 if kind == "block" else 0.0)}
 
 
+def put_in(block: str, bowl: str) -> Instruction:
+    """The instruction that puts the block of one colour into the bowl of another."""
+    return Instruction("in", Thing(block, "block"), Thing(bowl, "bowl"))
+
+
 @pytest.fixture
 def camera() -> PinholeCamera:
     close = Camera(PRESETS["close"], 64)
     return PinholeCamera.from_info({"intrinsics": close.intrinsics, "extrinsics": close.extrinsics})
+
+
+@pytest.fixture
+def grounder(camera: PinholeCamera) -> AppearanceGrounder:
+    return AppearanceGrounder(camera, PALETTE)
 
 
 @pytest.fixture

@@ -14,17 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from planning import Instruction, PinholeCamera
-from planning.grounding import COLORS, ROBOT_COLOR, TABLE_COLOR
+from envs.colors import palette
+from planning import Instruction, Palette, PinholeCamera
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import Rollout
 from textocvp.slots import SlotLayout
 
 LAYOUT = SlotLayout(content=4)  # x, y, z in metres, and the layer that it is drawn in
 BACKGROUND, BOWL, BLOCK, ARM = 0.0, 1.0, 2.0, 3.0
+LAYERS = {"block": BLOCK, "bowl": BOWL}
 BLOCK_SIZE, BOWL_RADIUS, BOWL_HEIGHT = 0.058, 0.069, 0.046
 HOME = np.array([0.34, 0.0, 0.13])
-NAMES = list(COLORS)
+
+PALETTE_INFO = palette()  # as in `info["palette"]`
+PALETTE = Palette.from_info(PALETTE_INFO)
+COLORS = PALETTE.colors
 
 
 class ShapeRenderer(Renderer):
@@ -68,6 +72,7 @@ class OracleWorldModel:
     Attributes:
         hands_off: colours of blocks that it wrongly imagines nobody can move.
         spare_slots: unused slots, with presence 0.
+        offsets: relation -> where its thing ends, (x, y) in metres from its target; (0, 0) where none is given.
     """
 
     def __init__(
@@ -77,15 +82,17 @@ class OracleWorldModel:
         *,
         hands_off: Sequence[str] = (),
         spare_slots: int = 2,
+        offsets: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         self.objects, self.camera, self.hands_off, self.spare_slots = objects, camera, hands_off, spare_slots
+        self.offsets = offsets or {}
         self.renderer = ShapeRenderer()
         self.calls: list[int] = []  # batch size of each imagination
 
     def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
-        slots = [self._slot(BACKGROUND, [0.5, 0, 0], TABLE_COLOR), self._slot(ARM, HOME, ROBOT_COLOR)]
+        slots = [self._slot(BACKGROUND, [0.5, 0, 0], PALETTE.table), self._slot(ARM, HOME, PALETTE.robot)]
         for item in self.objects():
-            layer = BLOCK if item["kind"] == "block" else BOWL
+            layer = LAYERS[item["kind"]]
             position = np.asarray(item["position"], dtype=float)
             middle = position if layer == BLOCK else position + np.array([0, 0, BOWL_HEIGHT / 2])
             slots.append(self._slot(layer, middle, 0.92 * np.array(COLORS[item["color"]])))
@@ -107,20 +114,21 @@ class OracleWorldModel:
 
     def _imagine(self, start_KD: Tensor, instruction: Instruction, horizon: int) -> Tensor:
         arm = self._find(start_KD, ARM, None)
-        block = self._find(start_KD, BLOCK, instruction.block)
-        bowl = self._find(start_KD, BOWL, instruction.bowl)
-        pick, place = start_KD[block, :3].double().numpy(), start_KD[bowl, :3].double().numpy()
-        place = np.array([*place[:2], 0.006 + BLOCK_SIZE / 2])
+        color = instruction.thing.color
+        block, target = (self._find(start_KD, LAYERS[one.kind], one.color) for one in instruction.things)
+        pick, place = start_KD[block, :3].double().numpy(), start_KD[target, :3].double().numpy()
+        offset_2 = self.offsets.get(instruction.relation, (0.0, 0.0))
+        place = np.array([*(place[:2] + offset_2), 0.006 + BLOCK_SIZE / 2])
         up, top = np.array([0, 0, 0.15]), np.array([0, 0, BLOCK_SIZE / 2 + 0.01])
         tip_T3 = _path(
             [HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1
         )
         film_TKD = start_KD[None].repeat(horizon + 1, 1, 1)
-        film_TKD[1:, arm] = self._slots(ARM, tip_T3[1:], ROBOT_COLOR)
-        if instruction.block not in self.hands_off:
+        film_TKD[1:, arm] = self._slots(ARM, tip_T3[1:], PALETTE.robot)
+        if color not in self.hands_off:
             share_T1 = np.linspace(0, 1, horizon + 1)[:, None]
             at_T3 = np.where(share_T1 < 2 / 7, pick, np.where(share_T1 > 5 / 7, place, tip_T3 - top))
-            film_TKD[1:, block] = self._slots(BLOCK, at_T3[1:], 0.92 * np.array(COLORS[instruction.block]))
+            film_TKD[1:, block] = self._slots(BLOCK, at_T3[1:], 0.92 * np.array(COLORS[color]))
         return film_TKD
 
     def _find(self, slots_KD: Tensor, layer: float, color: str | None) -> int:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from envs.camera import PRESETS, Camera
+from envs.physics.camera import PRESETS, Camera
 from planning import PinholeCamera
 
 

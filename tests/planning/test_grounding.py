@@ -6,15 +6,18 @@ from planning import (
     AppearanceGrounder,
     Goal,
     GroundingError,
+    Palette,
     PinholeCamera,
+    SegmentationGrounder,
     Thing,
-    goal_reached,
     ground,
-    ground_privileged,
+    ground_by_segmentation,
+    unmet,
 )
-from planning.grounding import COLORS, ROBOT_COLOR, color_distance, hard_masks
+from planning.grounding import color_distance
+from planning.masks import hard_masks
 from tests.planning.conftest import thing
-from tests.planning.oracle import ARM, BACKGROUND, OracleWorldModel
+from tests.planning.oracle import ARM, BACKGROUND, COLORS, PALETTE, PALETTE_INFO, OracleWorldModel
 from textocvp.rollout import Rollout
 
 BLACK = np.zeros((1, 64, 64, 3), np.uint8)
@@ -29,7 +32,7 @@ def test_every_thing_is_found_whatever_its_slot(
 ) -> None:
     for seed in range(5):
         parsed = oracle.parse(BLACK, seed=seed)
-        grounding = AppearanceGrounder(camera)(parsed)
+        grounding = AppearanceGrounder(camera, PALETTE)(parsed)
         assert set(grounding.things) == {Thing(item["color"], item["kind"]) for item in objects}
         layer_K = parsed.slots[0, 0, :, 3]
         assert [layer_K[k] for k in grounding.background] == [BACKGROUND]
@@ -37,28 +40,28 @@ def test_every_thing_is_found_whatever_its_slot(
         for thing_, slots in grounding.things.items():
             expected = torch.tensor(COLORS[thing_.color]) * 0.92
             torch.testing.assert_close(parsed.colors[0, 0, slots[0]], expected)
-    assert grounding.blocks == ("green", "red")
-    assert grounding.bowls == ("blue", "gray", "white")
-    assert len(grounding.instructions) == 6
+    assert [thing_.color for thing_ in grounding.of_kind("block")] == ["green", "red"]
+    assert [thing_.color for thing_ in grounding.of_kind("bowl")] == ["blue", "gray", "white"]
+    assert len(grounding.instructions("in")) == 6
 
 
 def test_missing_things_are_named(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
-    grounding = ground(oracle.parse(BLACK), camera)[0]
+    grounding = ground(oracle.parse(BLACK), camera, PALETTE)[0]
     with pytest.raises(GroundingError, match=r"no pink bowl is seen; seen: .*green block"):
-        grounding.find(Thing("pink", "bowl"))
+        grounding.slots_of(Thing("pink", "bowl"))
 
 
 @pytest.mark.parametrize("light", [0.75, 0.9, 1.0])
-def test_colours_are_told_apart_in_any_light(light: float) -> None:
-    seen = light * np.array([*COLORS.values(), ROBOT_COLOR])
-    cost = np.stack([color_distance(seen, color) for color in (*COLORS.values(), ROBOT_COLOR)], axis=1)
+def test_colours_are_named_apart_in_any_light(light: float) -> None:
+    seen = light * np.array([*COLORS.values(), PALETTE.robot])
+    cost = np.stack([color_distance(seen, color) for color in (*COLORS.values(), PALETTE.robot)], axis=1)
     wrong = np.flatnonzero(cost.argmin(1) != np.arange(len(cost)))
     assert [list(COLORS)[k] for k in wrong] == []
 
 
 def test_two_slots_on_one_object_are_one_thing(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
     parsed = oracle.parse(BLACK)
-    bowl = ground(parsed, camera)[0].find(Thing("blue", "bowl"))[0]
+    bowl = ground(parsed, camera, PALETTE)[0].slots_of(Thing("blue", "bowl"))[0]
     spare = int((parsed.presence[0, 0] < 0.5).nonzero()[0])
     slots = parsed.slots.clone()
     slots[..., spare, :] = slots[..., bowl, :]  # the shaded half of the bowl, a little to the right
@@ -66,43 +69,64 @@ def test_two_slots_on_one_object_are_one_thing(oracle: OracleWorldModel, camera:
     slots[..., bowl, 7] -= 4 / 32
     slots[..., spare, 7] += 4 / 32
     slots[..., spare, 4:7] = (slots[..., spare, 4:7] + 1) * 0.85 - 1
-    grounding = ground(with_slots(parsed, slots), camera)[0]
-    assert grounding.find(Thing("blue", "bowl")) == tuple(sorted((bowl, spare)))
+    grounding = ground(with_slots(parsed, slots), camera, PALETTE)[0]
+    assert grounding.slots_of(Thing("blue", "bowl")) == tuple(sorted((bowl, spare)))
 
 
 def test_a_far_fragment_does_not_take_a_name(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
     parsed = oracle.parse(BLACK)
-    before = ground(parsed, camera)[0]
-    red = before.find(Thing("red", "block"))[0]
+    before = ground(parsed, camera, PALETTE)[0]
+    red = before.slots_of(Thing("red", "block"))[0]
     spare = int((parsed.presence[0, 0] < 0.5).nonzero()[0])
     slots = parsed.slots.clone()
     slots[..., spare, :] = slots[..., red, :]
     slots[..., spare, 7:9] = torch.tensor([0.0, 0.8])
     slots[..., spare, 9:11] *= 0.5
-    after = ground(with_slots(parsed, slots), camera)[0]
+    after = ground(with_slots(parsed, slots), camera, PALETTE)[0]
     assert after.things == before.things
 
 
 def test_language_overrules_the_kind(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
-    grounding = ground(oracle.parse(BLACK), camera)[0]
-    told = grounding.told([Thing("gray", "block"), Thing("pink", "bowl")])
-    assert told.find(Thing("gray", "block")) == grounding.find(Thing("gray", "bowl"))
-    assert "gray" not in told.bowls and "pink" not in told.bowls
+    grounding = ground(oracle.parse(BLACK), camera, PALETTE)[0]
+    named = grounding.with_kinds([Thing("gray", "block"), Thing("pink", "bowl")])
+    assert named.slots_of(Thing("gray", "block")) == grounding.slots_of(Thing("gray", "bowl"))
+    assert not {"gray", "pink"} & {thing_.color for thing_ in named.of_kind("bowl")}
 
 
-def test_privileged_agrees_where_appearance_is_right(
+def test_the_segmentation_agrees_where_appearance_is_right(
     oracle: OracleWorldModel, objects, camera: PinholeCamera
 ) -> None:
     parsed = oracle.parse(BLACK, seed=3)
-    seen = ground(parsed, camera)[0]
+    seen = ground(parsed, camera, PALETTE)[0]
     winner = parsed.masks[0, 0].argmax(0)
     truth = torch.zeros_like(winner)
     truth[torch.isin(winner, torch.tensor(seen.arm))] = 1
-    for i, item in enumerate(objects):
-        truth[winner == seen.find(Thing(item["color"], item["kind"]))[0]] = 2 + i
-    assert ground_privileged(parsed, truth.numpy(), objects) == [seen]
+    objects = [{**item, "label": 9 - i} for i, item in enumerate(objects)]  # labels need not be in order
+    for item in objects:
+        truth[winner == seen.slots_of(Thing(item["color"], item["kind"]))[0]] = item["label"]
+    assert ground_by_segmentation(parsed, truth.numpy(), objects) == [seen]
+    info = {"segmentation": truth.numpy(), "objects": objects}
+    assert SegmentationGrounder.from_info(info)(parsed) == seen
     with pytest.raises(ValueError, match="segmentation is"):
-        ground_privileged(parsed, truth.numpy()[:32], objects)
+        ground_by_segmentation(parsed, truth.numpy()[:32], objects)
+
+
+def test_the_palette_of_info_decides_the_names(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
+    parsed = oracle.parse(BLACK)
+    colors = dict(PALETTE_INFO["colors"])
+    colors["crimson"] = colors.pop("red")
+    info = {
+        "camera": {"intrinsics": camera.intrinsics, "extrinsics": camera.extrinsics},
+        "palette": {**PALETTE_INFO, "colors": colors},
+    }
+    grounding = AppearanceGrounder.from_info(info)(parsed)
+    usual = ground(parsed, camera, PALETTE)[0]
+    assert grounding.slots_of(Thing("crimson", "block")) == usual.slots_of(Thing("red", "block"))
+    assert Thing("red", "block") not in grounding.things
+    # A robot that looks like the white bowl takes the bowl for itself.
+    others = {name: color for name, color in PALETTE.colors.items() if name != "white"}
+    mistaken = Palette(others, robot=PALETTE.colors["white"], table=PALETTE.table)
+    assert ground(parsed, camera, mistaken)[0].arm == usual.slots_of(Thing("white", "bowl"))
 
 
 def test_goal_reached_by_sight(objects, camera: PinholeCamera) -> None:
@@ -111,7 +135,7 @@ def test_goal_reached_by_sight(objects, camera: PinholeCamera) -> None:
 
     def reached() -> bool:
         parsed = oracle.parse(BLACK)
-        return goal_reached(parsed, ground(parsed, camera)[0], goal)
+        return not unmet(parsed, ground(parsed, camera, PALETTE)[0], goal)
 
     assert not reached()
     objects[0] = thing("block", "red", 0.60, -0.10) | {"position": (0.61, -0.11, 0.035)}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,15 +12,19 @@ import pytest
 
 import envs  # noqa: F401  (registers the environments)
 from planning import (
+    BeamPlanner,
+    Controller,
     Goal,
+    Grounder,
+    Grounding,
     Instruction,
-    InstructionPlanner,
+    PickAndPlace,
     PinholeCamera,
     RandomPlanner,
-    RandomSequencePlanner,
-    SequencePlanner,
+    SegmentationGrounder,
     run_episode,
 )
+from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 from textocvp.rollout import Rollout
 
@@ -27,13 +32,15 @@ from textocvp.rollout import Rollout
 class CameraOnly(gym.Wrapper):  # type: ignore[type-arg]
     """Strips `info` of everything a real robot would not have; `is_success` stays, for the result."""
 
+    KNOWN = ("camera", "palette", "is_success", "instruction")
+
     def reset(self, **kwargs: Any) -> Any:
         obs, info = self.env.reset(**kwargs)
-        return {"rgb": obs["rgb"]}, {key: info[key] for key in ("camera", "is_success", "instruction")}
+        return {"rgb": obs["rgb"]}, {key: info[key] for key in self.KNOWN}
 
     def step(self, action: Any) -> Any:
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return {"rgb": obs["rgb"]}, reward, terminated, truncated, {"is_success": info["is_success"]}
+        return {"rgb": obs["rgb"]}, reward, terminated, truncated, {key: info[key] for key in self.KNOWN}
 
 
 class Missing(gym.Wrapper):  # type: ignore[type-arg]
@@ -72,9 +79,13 @@ def oracle_for(env: gym.Env[Any, Any], seed: int, options: dict[str, Any] | None
     return OracleWorldModel(lambda: objects_now(env), PinholeCamera.from_info(info["camera"]))
 
 
+def one_step(world_model: OracleWorldModel) -> BeamPlanner:
+    return BeamPlanner(world_model, depth=1, candidates="scene", one_block_per_bowl=False)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_the_goal_is_reached_without_the_simulators_state(env: gym.Env[Any, Any], seed: int) -> None:
-    planner = InstructionPlanner(oracle_for(env, seed))
+    planner = one_step(oracle_for(env, seed))
     result = run_episode(CameraOnly(env), planner, seed=seed)
     assert result.success and result.believes_reached and result.error is None and result.gained == 1.0
     assert result.steps == 1 and result.attempts[0].plan.best.reaches_goal
@@ -86,15 +97,13 @@ def test_a_variant_of_a_scene_is_judged_by_its_own_instruction(env: gym.Env[Any,
     items = objects_now(env)
     block = next(item["color"] for item in items if item["kind"] == "block")
     for bowl in (item["color"] for item in items if item["kind"] == "bowl"):
-        variant = Instruction(block, bowl)
-        result = run_episode(
-            env, InstructionPlanner(oracle), seed=3, options=options | {"instruction": variant.text}
-        )
+        variant = put_in(block, bowl)
+        result = run_episode(env, one_step(oracle), seed=3, options=options | {"instruction": variant.text})
         assert result.success and result.attempts[0].instruction == variant
 
 
 def test_a_missed_pick_is_seen_and_tried_again(env: gym.Env[Any, Any]) -> None:
-    planner = InstructionPlanner(oracle_for(env, 1))
+    planner = one_step(oracle_for(env, 1))
     result = run_episode(Missing(env, 1), planner, seed=1)
     assert result.success and result.steps == 2
     assert [attempt.believes_reached for attempt in result.attempts] == [False, True]
@@ -115,50 +124,85 @@ def test_nobody_is_told_of_success(env: gym.Env[Any, Any]) -> None:
     blind = Blind(oracle.objects, oracle.camera)
     blind.first = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
     blind.calls = [0, 0]  # it sees the scene as it was before anything moved
-    result = run_episode(env, InstructionPlanner(blind), seed=0)
+    result = run_episode(env, one_step(blind), seed=0)
     assert result.success and not result.believes_reached and result.steps == 3
 
 
 def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:
     successes = 0
     for seed in range(8):
-        planner = RandomPlanner(oracle_for(env, seed), np.random.default_rng(seed))
+        planner = RandomPlanner(oracle_for(env, seed), np.random.default_rng(seed), depth=1)
         successes += run_episode(env, planner, seed=seed, replan=False).success
     assert successes <= 4
 
 
 def test_what_cannot_be_grounded_ends_the_episode_with_a_reason(env: gym.Env[Any, Any]) -> None:
-    planner = InstructionPlanner(oracle_for(env, 0))
+    planner = one_step(oracle_for(env, 0))
     missing = next(
         color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env))
     )
-    result = run_episode(env, planner, Goal((Instruction(missing, missing),)), seed=0)
+    result = run_episode(env, planner, Goal((put_in(missing, missing),)), seed=0)
     assert not result.success and result.steps == 0
     assert result.error is not None and f"no {missing} block" in result.error
 
 
-def test_privileged_grounding_reads_the_segmentation(env: gym.Env[Any, Any]) -> None:
-    planner = InstructionPlanner(oracle_for(env, 2))
-    assert run_episode(env, planner, seed=2, privileged=True).success
+def test_grounding_by_truth_reads_the_segmentation(env: gym.Env[Any, Any]) -> None:
+    planner = one_step(oracle_for(env, 2))
+    assert run_episode(env, planner, seed=2, ground=SegmentationGrounder.from_info).success
     with pytest.raises(KeyError, match="segmentation"):
-        run_episode(CameraOnly(env), planner, seed=2, privileged=True)
+        run_episode(CameraOnly(env), planner, seed=2, ground=SegmentationGrounder.from_info)
+
+
+def test_ground_and_controller_are_the_callers(env: gym.Env[Any, Any]) -> None:
+    """A grounder that swaps two bowls sends the block into the wrong one; a controller that misses moves nothing."""
+    oracle = oracle_for(env, 3, {"n_bowls": 2})
+    looks: list[Mapping[str, Any]] = []
+
+    def confused(info: Mapping[str, Any]) -> Grounder:
+        looks.append(info)
+
+        def swapped(parsed: Rollout) -> Grounding:
+            seen = SegmentationGrounder.from_info(info)(parsed)
+            one, other = seen.of_kind("bowl")
+            return replace(seen, things={**seen.things, one: seen.things[other], other: seen.things[one]})
+
+        return swapped
+
+    result = run_episode(
+        env, one_step(oracle), ground=confused, seed=3, options={"n_bowls": 2}, max_attempts=1
+    )
+    assert not result.success and result.believes_reached and result.attempts[0].plan.best.reaches_goal
+    assert len(looks) == 2 and looks[0] is not looks[1], "one for the plan, one for the look after it"
+
+    class Beside(Controller):
+        def act(self, rollout: Rollout, grounding: Grounding, instruction: Instruction) -> PickAndPlace:
+            right = super().act(rollout, grounding, instruction)
+            x, y = right.pick
+            return PickAndPlace((x - 0.1 if x > 0.5 else x + 0.1, y), right.place)
+
+    missed = run_episode(
+        env, one_step(oracle), controller=Beside, seed=3, options={"n_bowls": 2}, max_attempts=1
+    )
+    assert not missed.success and not missed.believes_reached and missed.gained == 0.0
+    usual = run_episode(env, one_step(oracle), seed=3, options={"n_bowls": 2}, max_attempts=1)
+    assert usual.success
 
 
 @pytest.mark.parametrize("replan", [True, False])
 def test_goals_of_two_steps(replan: bool) -> None:
     env = gym.make("PutBlocksInBowls-v0")
     for seed in range(2):
-        planner = SequencePlanner(oracle_for(env, seed))
+        planner = BeamPlanner(oracle_for(env, seed))
         result = run_episode(CameraOnly(env), planner, seed=seed, replan=replan)
         assert result.success and result.believes_reached
-        assert result.steps == len(Goal.parse(env.reset(seed=seed)[1]["instruction"]).pairs) >= 2
+        assert result.steps == len(Goal.parse(env.reset(seed=seed)[1]["instruction"]).instructions) >= 2
     env.close()
 
 
 def test_half_a_goal_is_half_gained() -> None:
     """Without another look, the step that failed stays undone and the plan's next step is carried out all the same."""
     env = gym.make("PutBlocksInBowls-v0")
-    planner = SequencePlanner(oracle_for(env, 0))
+    planner = BeamPlanner(oracle_for(env, 0))
     once = run_episode(Missing(env, 1), planner, seed=0, replan=False)
     assert (once.success, once.gained, once.steps) == (False, 0.5, 2)
     assert once.attempts[0].plan is once.attempts[1].plan
@@ -170,7 +214,7 @@ def test_half_a_goal_is_half_gained() -> None:
 
 def test_the_goals_own_steps_in_random_order_are_carried_out() -> None:
     env = gym.make("PutBlocksInBowls-v0")
-    planner = RandomSequencePlanner(oracle_for(env, 1), np.random.default_rng(0), told=True)
+    planner = RandomPlanner(oracle_for(env, 1), np.random.default_rng(0), from_goal=True)
     result = run_episode(CameraOnly(env), planner, seed=1, replan=False)
     assert (result.success, result.steps) == (True, 2)
     env.close()
@@ -179,5 +223,5 @@ def test_the_goals_own_steps_in_random_order_are_carried_out() -> None:
 def test_the_wrong_control_mode_is_refused() -> None:
     env = gym.make("PutBlockInBowl-v0", control="ee")
     with pytest.raises(ValueError, match="primitive"):
-        run_episode(env, InstructionPlanner(oracle_for(env, 0)), seed=0)
+        run_episode(env, one_step(oracle_for(env, 0)), seed=0)
     env.close()

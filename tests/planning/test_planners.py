@@ -2,26 +2,25 @@ import numpy as np
 import pytest
 
 from planning import (
-    AppearanceGrounder,
+    BeamPlanner,
     Controller,
     Goal,
     GroundingError,
     Instruction,
-    InstructionPlanner,
     RandomPlanner,
-    RandomSequencePlanner,
-    SequencePlanner,
 )
+from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 
 RGB = np.zeros((64, 64, 3), np.uint8)
+ONE_STEP = {"depth": 1, "candidates": "scene", "one_block_per_bowl": False}
 PAIRS = [(block, bowl) for block in ("red", "green") for bowl in ("blue", "gray", "white")]
 
 
 @pytest.mark.parametrize(("block", "bowl"), PAIRS)
-def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, camera, block: str, bowl: str) -> None:
-    plan = InstructionPlanner(oracle).plan(RGB, Goal((Instruction(block, bowl),)), AppearanceGrounder(camera))
-    assert plan.instruction == Instruction(block, bowl)
+def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, grounder, block: str, bowl: str) -> None:
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(RGB, Goal((put_in(block, bowl),)), grounder)
+    assert plan.instruction == put_in(block, bowl)
     assert [candidate.reaches_goal for candidate in plan.ranking] == [True] + [False] * 5
     scores = [candidate.score for candidate in plan.ranking]
     assert scores == sorted(scores, reverse=True)
@@ -29,38 +28,38 @@ def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, camera, blo
     assert plan.rollout.texts == (plan.instruction.text,) and plan.seconds > 0
 
 
-def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera) -> None:
+def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera, grounder) -> None:
     oracle = OracleWorldModel(lambda: objects, camera, hands_off=["red"])
-    plan = InstructionPlanner(oracle).plan(
-        RGB, Goal.parse("put the red block in the blue bowl"), AppearanceGrounder(camera)
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(
+        RGB, Goal.parse("put the red block in the blue bowl"), grounder
     )
     assert not any(candidate.reaches_goal for candidate in plan.ranking)
 
 
-def test_a_thing_that_is_not_there_is_an_error(oracle: OracleWorldModel, camera) -> None:
+def test_a_thing_that_is_not_there_is_an_error(oracle: OracleWorldModel, grounder) -> None:
     goal = Goal.parse("put the pink block in the blue bowl")
-    for planner in (InstructionPlanner(oracle), SequencePlanner(oracle)):
+    for planner in (BeamPlanner(oracle, **ONE_STEP), BeamPlanner(oracle)):
         with pytest.raises(GroundingError, match="no pink block"):
-            planner.plan(RGB, goal, AppearanceGrounder(camera))
+            planner.plan(RGB, goal, grounder)
 
 
-def test_random_planner_repeats_with_its_generator(oracle: OracleWorldModel, camera) -> None:
+def test_random_planner_repeats_with_its_generator(oracle: OracleWorldModel, grounder) -> None:
     goal = Goal.parse("put the red block in the blue bowl")
 
     def choices(seed: int) -> list[Instruction]:
-        planner = RandomPlanner(oracle, np.random.default_rng(seed))
-        return [planner.plan(RGB, goal, AppearanceGrounder(camera)).instruction for _ in range(20)]
+        planner = RandomPlanner(oracle, np.random.default_rng(seed), depth=1)
+        return [planner.plan(RGB, goal, grounder).instruction for _ in range(20)]
 
     assert choices(0) == choices(0) != choices(1)
     assert len(set(choices(0))) > 3
 
 
 @pytest.mark.parametrize("beam", [0, 2, 4])
-def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, camera, beam: int) -> None:
+def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, grounder, beam: int) -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
-    plan = SequencePlanner(oracle, beam=beam).plan(RGB, goal, AppearanceGrounder(camera))
+    plan = BeamPlanner(oracle, beam=beam).plan(RGB, goal, grounder)
     assert plan.best.reaches_goal
-    assert set(plan.best.instructions) == set(goal.pairs)
+    assert set(plan.best.instructions) == set(goal.instructions)
     assert [rollout.texts[0] for rollout in plan.rollouts] == [i.text for i in plan.best.instructions]
     # The second step starts from where the first was imagined to end: its block lies in its bowl already.
     first, second = plan.rollouts
@@ -71,65 +70,74 @@ def test_sequences_reach_goals_of_two_steps(oracle: OracleWorldModel, camera, be
         assert len(plan.ranking) == 6 * 2 and sum(c.reaches_goal for c in plan.ranking) == 2
 
 
-def test_a_taken_bowl_is_emptied_before_it_is_filled(oracle: OracleWorldModel, objects, camera) -> None:
+def test_one_step_of_a_longer_goal_is_any_of_its_own(oracle: OracleWorldModel, grounder) -> None:
+    goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(RGB, goal, grounder)
+    assert {candidate.instructions[0] for candidate in plan.ranking[:2]} == set(goal.instructions)
+    assert [candidate.reaches_goal for candidate in plan.ranking] == [True] * 2 + [False] * 4
+    assert oracle.calls == [6] and len(plan.rollouts) == 1
+
+
+def test_a_taken_bowl_is_emptied_before_it_is_filled(oracle: OracleWorldModel, objects, grounder) -> None:
     """The oracle imagines two blocks in one bowl without trouble; the planner knows better."""
     objects[1]["position"] = (0.60, -0.10, 0.035)  # green lies in blue
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
-    plan = SequencePlanner(oracle, beam=0).plan(RGB, goal, AppearanceGrounder(camera))
-    assert plan.best.instructions == (Instruction("green", "gray"), Instruction("red", "blue"))
+    plan = BeamPlanner(oracle, beam=0).plan(RGB, goal, grounder)
+    assert plan.best.instructions == (put_in("green", "gray"), put_in("red", "blue"))
     assert plan.best.reaches_goal
     for candidate in plan.ranking:
         first, second = candidate.instructions
-        assert first != Instruction("red", "blue") and first.bowl != second.bowl
+        assert first != put_in("red", "blue") and first.target != second.target
 
 
 def test_without_the_rule_a_taken_bowl_is_filled_like_any_other(
-    oracle: OracleWorldModel, objects, camera
+    oracle: OracleWorldModel, objects, grounder
 ) -> None:
     objects[1]["position"] = (0.60, -0.10, 0.035)
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
-    planner = SequencePlanner(oracle, beam=0, one_a_bowl=False)
-    firsts = {one.instructions[0] for one in planner.plan(RGB, goal, AppearanceGrounder(camera)).ranking}
-    assert Instruction("red", "blue") in firsts
+    planner = BeamPlanner(oracle, beam=0, one_block_per_bowl=False)
+    firsts = {one.instructions[0] for one in planner.plan(RGB, goal, grounder).ranking}
+    assert put_in("red", "blue") in firsts
 
 
-def test_where_no_bowl_has_room_something_is_tried(oracle: OracleWorldModel, objects, camera) -> None:
+def test_where_no_bowl_has_room_something_is_tried(oracle: OracleWorldModel, objects, grounder) -> None:
     del objects[3:]  # the blue bowl is the only one, and green lies in it
     objects[1]["position"] = (0.60, -0.10, 0.035)
     goal = Goal.parse("put the red block in the blue bowl")
-    plan = SequencePlanner(oracle).plan(RGB, goal, AppearanceGrounder(camera))
-    assert [candidate.instructions for candidate in plan.ranking] == [goal.pairs]
+    plan = BeamPlanner(oracle).plan(RGB, goal, grounder)
+    assert [candidate.instructions for candidate in plan.ranking] == [goal.instructions]
 
 
-def test_random_sequences(oracle: OracleWorldModel, camera) -> None:
+def test_random_sequences(oracle: OracleWorldModel, grounder) -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
 
-    def sequences(told: bool) -> list[tuple[Instruction, ...]]:
-        planner = RandomSequencePlanner(oracle, np.random.default_rng(0), told)
-        plans = [planner.plan(RGB, goal, AppearanceGrounder(camera)) for _ in range(12)]
+    def sequences(from_goal: bool) -> list[tuple[Instruction, ...]]:
+        planner = RandomPlanner(oracle, np.random.default_rng(0), from_goal=from_goal)
+        plans = [planner.plan(RGB, goal, grounder) for _ in range(12)]
         for plan in plans:  # the second step is imagined from the end of the first
             assert [rollout.texts[0] for rollout in plan.rollouts] == [s.text for s in plan.best.instructions]
             np.testing.assert_allclose(plan.rollouts[1].slots[0, 0], plan.rollouts[0].slots[0, -1])
         return [plan.best.instructions for plan in plans]
 
-    told = sequences(True)
-    assert set(told) == {goal.pairs, goal.pairs[::-1]} and told == sequences(True)
-    invented = sequences(False)
-    assert len(set(invented)) > 4
-    for steps in invented:
-        assert {step.block for step in steps} == {"red", "green"} and len({step.bowl for step in steps}) == 2
+    own = sequences(True)
+    assert set(own) == {goal.instructions, goal.instructions[::-1]} and own == sequences(True)
+    others = sequences(False)
+    assert len(set(others)) > 4
+    for steps in others:
+        assert {step.thing.color for step in steps} == {"red", "green"}
+        assert len({step.target for step in steps}) == 2
 
 
-def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, camera) -> None:
+def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, grounder) -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
     objects[0]["position"] = (0.60, -0.10, 0.035)  # red lies in blue
-    plan = SequencePlanner(oracle).plan(RGB, goal, AppearanceGrounder(camera))
-    assert plan.best.instructions == (Instruction("green", "gray"),)
+    plan = BeamPlanner(oracle).plan(RGB, goal, grounder)
+    assert plan.best.instructions == (put_in("green", "gray"),)
 
 
-def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera) -> None:
-    plan = InstructionPlanner(oracle).plan(
-        RGB, Goal.parse("put the red block in the gray bowl"), AppearanceGrounder(camera)
+def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera, grounder) -> None:
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(
+        RGB, Goal.parse("put the red block in the gray bowl"), grounder
     )
     action = Controller(camera).act(plan.rollout, plan.grounding, plan.instruction)
     np.testing.assert_allclose(action.pick, (0.45, -0.12), atol=0.01)

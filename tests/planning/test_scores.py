@@ -7,32 +7,31 @@ from scipy.spatial.distance import cdist
 
 from planning import (
     CarryScore,
-    Instruction,
-    Judge,
     PlacementScore,
+    SuccessCriterion,
     Thresholds,
     Trace,
     WeightedSum,
-    arm_block_distance,
-    block_bowl_distance,
-    ground,
     measure,
     measure_rollout,
 )
+from planning.masks import centroid_distance, contact_distance
+from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 
-LIMITS = Thresholds(arm_block_px=2.0, hold_frames=3, block_bowl_px=4.0, settle_frames=2)
+LIMITS = Thresholds(contact_px=2.0, contact_frames=3, settle_frames=2)
 
 
 def trace(arm: list[float], bowl: list[float], frames: tuple[int, ...] | None = None) -> Trace:
-    return Trace(frames or tuple(range(len(arm))), torch.tensor([arm]).float(), torch.tensor([bowl]).float())
+    contact_Bt, distance_Bt = torch.tensor([arm]).float(), torch.tensor([bowl]).float()
+    return Trace(frames or tuple(range(len(arm))), contact_Bt, distance_Bt, torch.tensor([4.0]))
 
 
-def test_arm_block_distance_equals_brute_force() -> None:
+def test_contact_distance_equals_brute_force() -> None:
     rng = np.random.default_rng(0)
     arm = torch.from_numpy(rng.random((3, 5, 20, 24)) < 0.01)
     block = torch.from_numpy(rng.random((3, 5, 20, 24)) < 0.01)
-    distance = arm_block_distance(arm, block)
+    distance = contact_distance(arm, block)
     for index in np.ndindex(3, 5):
         a, b = np.argwhere(arm[index].numpy()), np.argwhere(block[index].numpy())
         expected = cdist(a, b).min() if len(a) and len(b) else np.inf
@@ -42,31 +41,31 @@ def test_arm_block_distance_equals_brute_force() -> None:
 def test_unseen_things_are_infinitely_far() -> None:
     some, none = torch.ones(1, 1, 8, 8, dtype=torch.bool), torch.zeros(1, 1, 8, 8, dtype=torch.bool)
     for arm, block in ((some, none), (none, some), (none, none)):
-        assert torch.isinf(arm_block_distance(arm, block)).all()
-        assert torch.isinf(block_bowl_distance(arm, block)).all()
+        assert torch.isinf(contact_distance(arm, block)).all()
+        assert torch.isinf(centroid_distance(arm, block)).all()
 
 
-def test_block_bowl_distance_is_between_centroids() -> None:
+def test_centroid_distance_is_between_centroids() -> None:
     block, bowl = torch.zeros(1, 1, 16, 16, dtype=torch.bool), torch.zeros(1, 1, 16, 16, dtype=torch.bool)
     block[..., 2:4, 2:4] = True
     bowl[..., 5:9, 6:10] = True
-    assert block_bowl_distance(block, bowl).item() == pytest.approx(np.hypot(5, 4))
+    assert centroid_distance(block, bowl).item() == pytest.approx(np.hypot(5, 4))
 
 
-def test_held_counts_the_longest_run() -> None:
-    assert trace([1, 9, 1, 1, 1, 9, 1, 1], [0] * 8).held(2).item() == 3
-    assert trace([9, 9], [0, 0]).held(2).item() == 0
+def test_contact_counts_the_longest_run() -> None:
+    assert trace([1, 9, 1, 1, 1, 9, 1, 1], [0] * 8).longest_contact(2).item() == 3
+    assert trace([9, 9], [0, 0]).longest_contact(2).item() == 0
     # Looked at every second frame: 2, 4 and 6 hold, so 2..6 does.
-    assert trace([9, 1, 1, 1, 9], [0] * 5, frames=(0, 2, 4, 6, 8)).held(2).item() == 5
+    assert trace([9, 1, 1, 1, 9], [0] * 5, frames=(0, 2, 4, 6, 8)).longest_contact(2).item() == 5
 
 
-def test_judge_wants_both_the_carry_and_the_placement() -> None:
-    judge = Judge(LIMITS)
-    assert judge(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 3])).all()
-    assert not judge(trace([9, 1, 1, 9, 1], [20, 20, 9, 3, 3])).any()  # never three frames in a row
-    assert not judge(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 5])).any()  # rolled out again
-    assert not judge(trace([9, 1, 1, 1, 9], [20, 20, 9, 5, 3])).any()  # only passing through
-    assert not judge(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, float("inf")])).any()  # vanished
+def test_success_wants_both_the_carry_and_the_placement() -> None:
+    criterion = SuccessCriterion(LIMITS)
+    assert criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 3])).all()
+    assert not criterion(trace([9, 1, 1, 9, 1], [20, 20, 9, 3, 3])).any()  # never three frames in a row
+    assert not criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 5])).any()  # rolled out again
+    assert not criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 5, 3])).any()  # only passing through
+    assert not criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, float("inf")])).any()  # vanished
 
 
 def test_scores_rank_nearer_and_longer_higher() -> None:
@@ -93,39 +92,39 @@ def test_scores_rank_nearer_and_longer_higher() -> None:
 def test_traces_join_over_steps() -> None:
     joined = trace([9, 1, 1], [9, 9, 9]).then(trace([1, 9, 9], [9, 3, 3]), length=3)
     assert joined.frames == (0, 1, 2, 3, 4, 5)
-    assert joined.held(2).item() == 3
-    assert Judge(LIMITS)(joined).all()
+    assert joined.longest_contact(2).item() == 3
+    assert SuccessCriterion(LIMITS)(joined).all()
 
 
 def test_measure_checks_shapes() -> None:
     mask = torch.ones(1, 2, 8, 8, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"\(B, t, H, W\)"):
-        measure(mask, mask, mask[:, :1])
+        measure(mask, mask, mask[:, :1], ["in"])
 
 
-def test_judge_tells_the_instruction_from_every_other(oracle: OracleWorldModel, camera) -> None:
+def test_the_criterion_tells_the_instruction_from_every_other(oracle: OracleWorldModel, grounder) -> None:
     parsed = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
-    grounding = ground(parsed, camera)[0]
-    instructions = grounding.instructions
+    grounding = grounder(parsed)
+    instructions = grounding.instructions("in")
     assert len(instructions) == 6
     rollout = oracle.rollout(parsed, [i.text for i in instructions])
     for wanted in instructions:
-        verdict = Judge()(measure_rollout(rollout, grounding, wanted))
+        verdict = SuccessCriterion()(measure_rollout(rollout, grounding, wanted))
         assert [i for i, good in zip(instructions, verdict, strict=True) if good] == [wanted]
     each = measure_rollout(rollout, [grounding] * 6, instructions)
-    assert Judge()(each).all()
+    assert SuccessCriterion()(each).all()
     # The frames that a planner looks at lead to the same final distances.
     few = measure_rollout(rollout, grounding, instructions, frames=(0, 4, 8, 12, 16, 20, 23, 24))
-    torch.testing.assert_close(few.block_bowl_Bt[:, -1], each.block_bowl_Bt[:, -1])
+    torch.testing.assert_close(few.distance_Bt[:, -1], each.distance_Bt[:, -1])
     with pytest.raises(ValueError, match="one or 6"):
         measure_rollout(rollout, [grounding] * 2, instructions)
     with pytest.raises(LookupError, match="no pink block"):
-        measure_rollout(rollout, grounding, Instruction("pink", "blue"))
+        measure_rollout(rollout, grounding, put_in("pink", "blue"))
 
 
-def test_a_robot_out_of_sight_holds_nothing(oracle: OracleWorldModel, camera) -> None:
+def test_a_robot_out_of_sight_holds_nothing(oracle: OracleWorldModel, grounder) -> None:
     parsed = oracle.parse(np.zeros((1, 64, 64, 3), np.uint8))
-    grounding = ground(parsed, camera)[0]
-    rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions])
-    armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions)
-    assert torch.isinf(armless.arm_block_Bt).all() and not Judge()(armless).any()
+    grounding = grounder(parsed)
+    rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions("in")])
+    armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions("in"))
+    assert torch.isinf(armless.contact_Bt).all() and not SuccessCriterion()(armless).any()

@@ -1,10 +1,11 @@
 import pytest
 
 from planning import Goal, Instruction, Thing
+from tests.planning.conftest import put_in
 
 
 def test_instruction_text_round_trip() -> None:
-    instruction = Instruction("red", "blue")
+    instruction = put_in("red", "blue")
     assert instruction.text == "put the red block in the blue bowl"
     assert Instruction.parse(instruction.text) == instruction
 
@@ -20,7 +21,7 @@ def test_instruction_wants_exactly_one_pair(text: str) -> None:
 
 def test_goal_of_the_environments_grammar() -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
-    assert goal.pairs == (Instruction("red", "blue"), Instruction("green", "gray"))
+    assert goal.instructions == (put_in("red", "blue"), put_in("green", "gray"))
     assert goal.things == (
         Thing("red", "block"),
         Thing("blue", "bowl"),
@@ -30,7 +31,7 @@ def test_goal_of_the_environments_grammar() -> None:
 
 
 def test_goal_is_checked() -> None:
-    with pytest.raises(ValueError, match="at least one pair"):
+    with pytest.raises(ValueError, match="at least one instruction"):
         Goal.parse("hello")
-    with pytest.raises(ValueError, match="each block once"):
-        Goal((Instruction("red", "blue"), Instruction("red", "gray")))
+    with pytest.raises(ValueError, match="each thing once"):
+        Goal((put_in("red", "blue"), put_in("red", "gray")))

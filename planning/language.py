@@ -1,0 +1,116 @@
+"""What is asked for: things, instructions and goals, as values and as sentences.
+
+    put the red block in the blue bowl and the green block in the gray bowl
+
+The grammar of the data's captions (paper, section 4.1). What may stand between two "and" says `RELATIONS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from planning.relations import RELATIONS
+
+
+@dataclass(frozen=True, order=True)
+class Thing:
+    """An object as language names it. No two objects of one scene share a colour."""
+
+    color: str
+    kind: str
+
+    def __str__(self) -> str:
+        return f"{self.color} {self.kind}"
+
+
+@dataclass(frozen=True, order=True)
+class Instruction:
+    """One pick-and-place.
+
+    Attributes:
+        relation: how the thing shall stand to its target; a key of `RELATIONS`.
+        thing: what is moved.
+        target: where it is moved to.
+
+    Raises:
+        ValueError: if there is no such relation, or it does not join these kinds of things.
+    """
+
+    relation: str
+    thing: Thing
+    target: Thing
+
+    def __post_init__(self) -> None:
+        if self.relation not in RELATIONS:
+            raise ValueError(f"no relation {self.relation!r}; there are: {', '.join(RELATIONS)}")
+        kinds = RELATIONS[self.relation].kinds
+        if (self.thing.kind, self.target.kind) != kinds:
+            raise ValueError(
+                f"{self.relation!r} joins {' and '.join(kinds)}, not {self.thing} and {self.target}"
+            )
+
+    @property
+    def text(self) -> str:
+        """The sentence."""
+        return "put " + RELATIONS[self.relation].template.format(thing=self.thing, target=self.target)
+
+    @property
+    def things(self) -> tuple[Thing, Thing]:
+        """The thing and its target."""
+        return self.thing, self.target
+
+    @classmethod
+    def parse(cls, text: str) -> Instruction:
+        """The inverse of `text`.
+
+        Raises:
+            ValueError: if the sentence does not ask for exactly one thing.
+        """
+        asked = _parse(text)
+        if len(asked) != 1:
+            forms = ", ".join(f"'put {relation.template}'" for relation in RELATIONS.values())
+            raise ValueError(f"expected one instruction of the form {forms}, got {text!r}")
+        return asked[0]
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Which instructions shall be fulfilled at the end; the order does not matter.
+
+    Raises:
+        ValueError: if there is no instruction, or one thing is sent to two places.
+    """
+
+    instructions: tuple[Instruction, ...]
+
+    def __post_init__(self) -> None:
+        moved = [str(one.thing) for one in self.instructions]
+        if not moved or len(set(moved)) < len(moved):
+            raise ValueError(f"a goal needs at least one instruction and moves each thing once, got {moved}")
+
+    @classmethod
+    def parse(cls, text: str) -> Goal:
+        """All instructions of a sentence, in its order.
+
+        Raises:
+            ValueError: if it has none, or moves one thing twice.
+        """
+        return cls(_parse(text))
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Everything that the goal names."""
+        return tuple(dict.fromkeys(thing for one in self.instructions for thing in one.things))
+
+
+def _parse(text: str) -> tuple[Instruction, ...]:
+    """Whatever a sentence asks for, in its order."""
+    found = []
+    for name, relation in RELATIONS.items():
+        for match in relation.pattern.finditer(text.lower()):
+            things = (
+                Thing(match[role], kind)
+                for role, kind in zip(("thing", "target"), relation.kinds, strict=True)
+            )
+            found.append((match.start(), Instruction(name, *things)))
+    return tuple(instruction for _, instruction in sorted(found))
