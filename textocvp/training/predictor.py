@@ -100,12 +100,10 @@ class PredictorStage(nn.Module):
         super().__init__()
         self.text: TextEncoder = model.text
         self.predictor: SlotPredictor = model.predictor
-        if not self.predictor.hears_text:  # several processes would wait for gradients that never come
+        if not self.predictor.uses_text:  # several processes would wait for gradients that never come
             self.text.requires_grad_(False)
 
-    def forward(
-        self, seen_BTKD: Tensor, words: WordBatch, imagined: int, forgetful_B: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, seen_BTKD: Tensor, words: WordBatch, imagined: int) -> Tensor:
         """Predictions (B, S, K, D), the last of which is of the frame number T + imagined (the first is
         number 0).
 
@@ -116,11 +114,11 @@ class PredictorStage(nn.Module):
             return self.predictor.rollout(seen_BTKD, text, imagined + 1).slots_BSKD
         if imagined:
             with torch.no_grad():
-                dreamt_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
+                imagined_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
             # Under autocast some versions of torch would reuse weights that were cast without a gradient.
             torch.clear_autocast_cache()
-            seen_BTKD = torch.cat([seen_BTKD, dreamt_BSKD], dim=1)
-        return self.predictor(seen_BTKD, text, forgetful_B)
+            seen_BTKD = torch.cat([seen_BTKD, imagined_BSKD], dim=1)
+        return self.predictor(seen_BTKD, text)
 
 
 def train(args: PredictorTraining) -> InstructionFollowing | None:
@@ -244,7 +242,7 @@ def fit(
         mine = exercise(args, model.config.predictor, batches, step).select(run.rows).to(run.device)
         for part in run.parts():
             task = mine.select(part)
-            asked = (task.seen_BTKD, task.batch.words, task.lesson.imagined, task.forgetful_B)
+            asked = (task.seen_BTKD, task.batch.words, task.lesson.imagined)
             predicted_BSKD = run.module(*asked).float()
             loss = slot_loss(predicted_BSKD, task.true_BSKD, task.weights_BSK, layout, std_C, whole=1.0)
             total = loss.total(args.scale_weight, args.content_weight)
