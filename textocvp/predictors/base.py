@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from textocvp.layers import KeyValueCache, mask_bias, sinusoids
+from textocvp.layers import FeedForward, KeyValueCache, mask_bias, sinusoids
 from textocvp.slots import SlotLayout, SlotState
 
 if TYPE_CHECKING:
@@ -237,19 +237,15 @@ class SlotPredictor(nn.Module):
             past_BTkD = torch.stack(frames[cached:][-self.config.window :], dim=1)
             next_B1kD, map_BnhkL = self._predict(past_BTkD, state, newest_only=True)
             frames.append(next_B1kD[:, 0])
-            if return_attention:
-                maps.append(map_BnhkL)
-        slots_BSkD = torch.stack(frames[-steps:], dim=1)
-        attention_BSnhkL = torch.stack(maps, dim=1) if return_attention else None  # type: ignore[arg-type]
+            maps.append(map_BnhkL)
 
-        if used_k.shape == used_K.shape:
-            return Imagined(slots_BSkD, attention_BSnhkL)
+        slots_BSkD = torch.stack(frames[-steps:], dim=1).to(seed_BTKD.dtype)
         slots_BSKD = seed_BTKD[:, -1:].repeat(1, steps, 1, 1).index_copy(2, used_k, slots_BSkD)
-        if attention_BSnhkL is None:
+        if not return_attention:
             return Imagined(slots_BSKD)
-        B, S, n, h, _, L = attention_BSnhkL.shape
-        none_BSnhKL = attention_BSnhkL.new_zeros(B, S, n, h, len(used_K), L)
-        return Imagined(slots_BSKD, none_BSnhKL.index_copy(4, used_k, attention_BSnhkL))
+        maps_BSnhkL = torch.stack(maps, dim=1)  # type: ignore[arg-type]
+        none_BSnhKL = maps_BSnhkL.new_zeros(*maps_BSnhkL.shape[:4], len(used_K), maps_BSnhkL.shape[-1])
+        return Imagined(slots_BSKD, none_BSnhKL.index_copy(4, used_k, maps_BSnhkL))
 
     def _start(self, seed_BTKD: Tensor, text: TextTokens, cached_frames: int = 0) -> RolloutState:
         """The state before the first step, with caches for so many frames, or without any."""
@@ -326,6 +322,11 @@ class SlotPredictor(nn.Module):
                 f"this predictor was built for a past of 1 to {self.config.window} frames (`window`), "
                 f"this needs {past}"
             )
+
+
+def feed_forward(config: PredictorConfig) -> nn.Sequential:
+    """A feed-forward net after a norm."""
+    return nn.Sequential(nn.LayerNorm(config.dim, eps=1e-6), FeedForward(config.dim, config.hidden))
 
 
 def _log(scale: Tensor) -> Tensor:

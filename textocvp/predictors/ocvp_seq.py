@@ -12,8 +12,8 @@ from typing import Literal
 
 from torch import Tensor, nn
 
-from textocvp.layers import FeedForward, KeyValueCache, SelfAttention, mask_bias
-from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor
+from textocvp.layers import KeyValueCache, SelfAttention, mask_bias
+from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor, feed_forward
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class OCVPSeqLayer(nn.Module):
 
     def __init__(self, config: PredictorConfig) -> None:
         super().__init__()
-        self.objects = _Block(config, feed_forward=config.feed_forwards == 2)
-        self.time = _Block(config, feed_forward=True)
+        self.objects = _Block(config, config.feed_forwards == 2)
+        self.time = _Block(config, True)
 
     def forward(
         self,
@@ -93,15 +93,11 @@ class OCVPSeqLayer(nn.Module):
 class _Block(nn.Module):
     """Self-attention and perhaps a feed-forward net, both pre-norm and residual."""
 
-    def __init__(self, config: PredictorConfig, feed_forward: bool) -> None:
+    def __init__(self, config: PredictorConfig, with_feed_forward: bool) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(config.dim, eps=1e-6)
         self.attention = SelfAttention(config.dim, config.heads)
-        self.feed_forward = (
-            nn.Sequential(nn.LayerNorm(config.dim, eps=1e-6), FeedForward(config.dim, config.hidden))
-            if feed_forward
-            else None
-        )
+        self.feed_forward = feed_forward(config) if with_feed_forward else None
 
     def forward(
         self,

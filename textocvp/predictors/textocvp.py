@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from textocvp.layers import MASKED, FeedForward, KeyValueCache, SelfAttention, TextAttention, mask_bias
-from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor
+from textocvp.layers import MASKED, KeyValueCache, SelfAttention, TextAttention, mask_bias
+from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor, feed_forward
 from textocvp.slots import SlotLayout, SlotState
 
 if TYPE_CHECKING:
@@ -105,10 +105,7 @@ class TextOCVPLayer(nn.Module):
         self.self_attention = SelfAttention(config.dim, config.heads)
         self.norm_text = nn.LayerNorm(config.dim, eps=1e-6)
         self.text_attention = TextAttention(config.dim, config.heads, text_dim)
-        self.feed_forwards = nn.ModuleList(
-            nn.Sequential(nn.LayerNorm(config.dim, eps=1e-6), FeedForward(config.dim, config.hidden))
-            for _ in range(config.feed_forwards)
-        )
+        self.feed_forwards = nn.ModuleList(feed_forward(config) for _ in range(config.feed_forwards))
         # How much a slot of the wrong colour loses of a word's attention, per unit of squared RGB distance.
         self.color_gain_h = nn.Parameter(torch.full((config.heads,), 4.0)) if config.color_bias else None
 
@@ -130,8 +127,8 @@ class TextOCVPLayer(nn.Module):
             text_bias = text_bias + self.color_gain_h[:, None, None] * match_BNL[:, None]
         text_update_BNC, map_BhNL = self.text_attention(self.norm_text(x_BNC), keys_values, text_bias)
         x_BNC = x_BNC + text_update_BNC
-        for feed_forward in self.feed_forwards:
-            x_BNC = x_BNC + feed_forward(x_BNC)
+        for update in self.feed_forwards:
+            x_BNC = x_BNC + update(x_BNC)
         return x_BNC, map_BhNL
 
 
