@@ -96,7 +96,6 @@ class SelfAttention(nn.Module):
         self,
         x_BMC: Tensor,
         bias: Tensor | None,
-        *,
         newest: int | None = None,
         cache: KeyValueCache | None = None,
     ) -> Tensor:

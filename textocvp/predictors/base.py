@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from textocvp.layers import FeedForward, KeyValueCache, mask_bias, sinusoids
+from textocvp.layers import FeedForward, KeyValueCache, sinusoids
 from textocvp.slots import SlotLayout, SlotState
 
 if TYPE_CHECKING:
@@ -93,13 +93,15 @@ class RolloutState:
 
     Attributes:
         text: what `_text_context` returned, computed once.
-        caches: keys and values of past frames, one cache for each layer; None: every step computes them again.
-        unused_BMK: which slots were unused in the M frames that are in the caches.
+        caches: keys and values of earlier frames, one cache for each layer; None: every step computes them again.
+        unused_BMK: which slots are unused in the M frames that the newest one may attend to.
+        cached: how many of the M frames are in the caches.
     """
 
     text: Any
     caches: list[KeyValueCache | None]
     unused_BMK: Tensor
+    cached: int = 0
 
 
 class SlotPredictor(nn.Module):
@@ -155,22 +157,13 @@ class SlotPredictor(nn.Module):
 
     @abstractmethod
     def _transform(
-        self,
-        x_BTKC: Tensor,
-        unused_BMK: Tensor,
-        frame_bias_TM: Tensor | None,
-        state: RolloutState,
-        *,
-        newest_only: bool,
+        self, x_BTKC: Tensor, state: RolloutState, newest_only: bool
     ) -> tuple[Tensor, Tensor | None]:
         """Apply the layers.
 
         Args:
-            x_BTKC: one token for each slot of T frames.
-            unused_BMK: unused slots, to be masked; M > T if `state.caches` holds earlier frames.
-            frame_bias_TM: logit terms between frames; None if each may attend to all.
-            state: holds what `_text_context` returned, and the caches.
-            newest_only: only the newest frame's tokens are needed, others may be left out.
+            x_BTKC: one token for each slot of T frames, the last ones of `state.unused_BMK`.
+            newest_only: tokens of earlier frames than the newest are not needed.
 
         Returns:
             Tokens (B, T or 1, K, C), and the newest frame's attention to the words (B, n, h, K, L), if any.
@@ -233,8 +226,7 @@ class SlotPredictor(nn.Module):
         frames = list(seed_BTkD.unbind(1))  # (B, k, D) each; first the T of the seed, in the end T + S
         maps = []
         for _ in range(steps):
-            cached = state.unused_BMK.shape[1]
-            past_BTkD = torch.stack(frames[cached:][-self.config.window :], dim=1)
+            past_BTkD = torch.stack(frames[state.cached :][-self.config.window :], dim=1)
             next_B1kD, map_BnhkL = self._predict(past_BTkD, state, newest_only=True)
             frames.append(next_B1kD[:, 0])
             maps.append(map_BnhkL)
@@ -249,41 +241,38 @@ class SlotPredictor(nn.Module):
 
     def _start(self, seed_BTKD: Tensor, text: TextTokens, cached_frames: int = 0) -> RolloutState:
         """The state before the first step, with caches for so many frames, or without any."""
-        B, _, K, _ = seed_BTKD.shape
-        tokens = cached_frames * self._tokens_per_frame(K)
+        tokens = cached_frames * self._tokens_per_frame(seed_BTKD.shape[2])
+        caches = [KeyValueCache(tokens) if tokens else None for _ in self.layers]
         return RolloutState(
-            text=self._text_context(text, seed_BTKD[:, -1]),
-            caches=[KeyValueCache(tokens) if tokens else None for _ in self.layers],
-            unused_BMK=torch.zeros(B, 0, K, dtype=torch.bool, device=seed_BTKD.device),
+            self._text_context(text, seed_BTKD[:, -1]), caches, self.layout.used(seed_BTKD[:, :0])
         )
 
     def _predict(
-        self, slots_BTKD: Tensor, state: RolloutState, *, newest_only: bool
+        self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool
     ) -> tuple[Tensor, Tensor | None]:
         """The slots after every frame (B, T, K, D), or only after the newest (B, 1, K, D), and its attention."""
-        start, T = state.unused_BMK.shape[1], slots_BTKD.shape[1]
-        unused_BMK = torch.cat([state.unused_BMK, ~self.layout.used(slots_BTKD)], dim=1)
-        if state.caches[0] is not None:
-            state.unused_BMK = unused_BMK
-        x_BTKC = self.slot_in(self._features(slots_BTKD)) + self._time_codes(start, T)[:, None]
-        bias_TM = self._frame_bias(start, T, slots_BTKD.device)
-        x_BTKC, map_BnhKL = self._transform(x_BTKC, unused_BMK, bias_TM, state, newest_only=newest_only)
+        start, T = state.cached, slots_BTKD.shape[1]
+        unused_BTK = ~self.layout.used(slots_BTKD)
+        state.unused_BMK = torch.cat([state.unused_BMK[:, :start], unused_BTK], dim=1)
+        if any(state.caches):
+            state.cached = start + T
+        # A code tells the number of a frame (`causal`) or its age (`window`).
+        codes_TC = self.ages[start : start + T] if self.config.causal else self.ages[:T].flip(0)
+        x_BTKC = self.slot_in(self._features(slots_BTKD)) + codes_TC[:, None]
+        x_BTKC, map_BnhKL = self._transform(x_BTKC, state, newest_only)
         if newest_only:
             slots_BTKD, x_BTKC = slots_BTKD[:, -1:], x_BTKC[:, -1:]
         return self._update(slots_BTKD, self.slot_out(x_BTKC)), map_BnhKL
 
     # ---- their parts
 
-    def _time_codes(self, start: int, frames: int) -> Tensor:
-        """(T, C) for frames from number `start` on: the code of their number (`causal`) or age (`window`)."""
-        return self.ages[start : start + frames] if self.config.causal else self.ages[:frames].flip(0)
-
-    def _frame_bias(self, start: int, frames: int, device: torch.device) -> Tensor | None:
-        """Logit terms (T, M) that mask later frames, for frames from number `start` on; None if there are none."""
-        if not self.config.causal or frames == 1:
-            return None
-        number_M = torch.arange(start + frames, device=device)
-        return mask_bias(number_M > number_M[start:, None])
+    def _masked(self, unused_BMK: Tensor, frames: int) -> Tensor:
+        """(B, T, M, K) bool: what the last T frames may not attend to, unused slots and, if `causal`, later frames."""
+        masked_BTMK = unused_BMK[:, None].expand(-1, frames, -1, -1)
+        if not self.config.causal:
+            return masked_BTMK
+        number_M = torch.arange(unused_BMK.shape[1], device=unused_BMK.device)
+        return masked_BTMK | (number_M > number_M[-frames:, None])[..., None]
 
     def _features(self, slots: Tensor) -> Tensor:
         """What the network reads of each slot."""

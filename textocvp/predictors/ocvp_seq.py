@@ -35,30 +35,14 @@ class OCVPSeqPredictor(SlotPredictor):
     def _tokens_per_frame(self, slots: int) -> int:
         return 1  # a cache holds the track of one slot through time, K of them as a batch
 
-    def _transform(
-        self,
-        x_BTKC: Tensor,
-        unused_BMK: Tensor,
-        frame_bias_TM: Tensor | None,
-        state: RolloutState,
-        *,
-        newest_only: bool,
-    ) -> tuple[Tensor, None]:
+    def _transform(self, x_BTKC: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, None]:
         T = x_BTKC.shape[1]
-        object_bias_N11K = mask_bias(unused_BMK[:, -T:].flatten(0, 1))[:, None, None]
-        time_bias_BKTM = mask_bias(unused_BMK.transpose(1, 2))[:, :, None]
-        if frame_bias_TM is not None:
-            time_bias_BKTM = time_bias_BKTM + frame_bias_TM
-        time_bias_N1TM = time_bias_BKTM.flatten(0, 1)[:, None]
-        last = len(self.layers) - 1
+        object_bias_N11K = mask_bias(state.unused_BMK[:, -T:].flatten(0, 1))[:, None, None]
+        masked_BTMK = self._masked(state.unused_BMK, T)
+        time_bias_N1TM = mask_bias(masked_BTMK.permute(0, 3, 1, 2).flatten(0, 1))[:, None]
         for index, layer in enumerate(self.layers):
-            x_BTKC = layer(
-                x_BTKC,
-                object_bias_N11K,
-                time_bias_N1TM,
-                newest_only=newest_only and index == last,
-                cache=state.caches[index],
-            )
+            cut = newest_only and index == len(self.layers) - 1
+            x_BTKC = layer(x_BTKC, object_bias_N11K, time_bias_N1TM, cut, state.caches[index])
         return x_BTKC, None
 
 
@@ -75,7 +59,6 @@ class OCVPSeqLayer(nn.Module):
         x_BTKC: Tensor,
         object_bias_N11K: Tensor,
         time_bias_N1TM: Tensor,
-        *,
         newest_only: bool,
         cache: KeyValueCache | None,
     ) -> Tensor:
@@ -86,7 +69,7 @@ class OCVPSeqLayer(nn.Module):
         if newest is not None:
             time_bias_N1TM = time_bias_N1TM[..., -1:, :]
         tracks_NTC = x_BTKC.transpose(1, 2).flatten(0, 1)
-        tracks_NTC = self.time(tracks_NTC, time_bias_N1TM, newest=newest, cache=cache)
+        tracks_NTC = self.time(tracks_NTC, time_bias_N1TM, newest, cache)
         return tracks_NTC.unflatten(0, (B, K)).transpose(1, 2)
 
 
@@ -100,14 +83,9 @@ class _Block(nn.Module):
         self.feed_forward = feed_forward(config) if with_feed_forward else None
 
     def forward(
-        self,
-        x_BMC: Tensor,
-        bias: Tensor,
-        *,
-        newest: int | None = None,
-        cache: KeyValueCache | None = None,
+        self, x_BMC: Tensor, bias: Tensor, newest: int | None = None, cache: KeyValueCache | None = None
     ) -> Tensor:
         """The last `newest` tokens (default: all) after the block."""
-        attended_BNC = self.attention(self.norm(x_BMC), bias, newest=newest, cache=cache)
+        attended_BNC = self.attention(self.norm(x_BMC), bias, newest, cache)
         x_BNC = attended_BNC + (x_BMC if newest is None else x_BMC[:, -newest:])
         return x_BNC if self.feed_forward is None else x_BNC + self.feed_forward(x_BNC)

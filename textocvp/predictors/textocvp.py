@@ -63,35 +63,20 @@ class TextOCVPPredictor(SlotPredictor):
         keys_values = [layer.text_attention.keys_values(text.embeddings_BLC) for layer in self.layers]  # type: ignore
         return TextContext(keys_values, mask_bias(~text.mask_BL)[:, None, None], match_BKL)
 
-    def _transform(
-        self,
-        x_BTKC: Tensor,
-        unused_BMK: Tensor,
-        frame_bias_TM: Tensor | None,
-        state: RolloutState,
-        *,
-        newest_only: bool,
-    ) -> tuple[Tensor, Tensor]:
+    def _transform(self, x_BTKC: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor]:
         T, K = x_BTKC.shape[1:3]
         text: TextContext = state.text
-        x_BNC = x_BTKC.flatten(1, 2)  # N = T * K tokens
-        bias = mask_bias(unused_BMK.flatten(1))[:, None, None]  # (B, 1, 1, M * K)
-        if frame_bias_TM is not None:
-            bias = bias + frame_bias_TM.repeat_interleave(K, 0).repeat_interleave(K, 1)  # (B, 1, N, M * K)
+        x_BNC = x_BTKC.flatten(1, 2)  # N = T * K tokens attend to M * K
+        masked_BTMK = self._masked(state.unused_BMK, T)
+        bias = mask_bias(masked_BTMK.flatten(2)).repeat_interleave(K, 1)[:, None]  # (B, 1, N, M * K)
         maps = []
         for index, layer in enumerate(self.layers):
             newest = None
             if newest_only and T > 1 and index == len(self.layers) - 1:
                 newest, T, bias = K, 1, bias[..., -K:, :]  # nobody needs older frames after the last layer
-            x_BNC, map_BhNL = layer(
-                x_BNC,
-                bias,
-                text.keys_values[index],
-                text.bias_B11L,
-                None if text.match_BKL is None else text.match_BKL.repeat(1, T, 1),
-                newest=newest,
-                cache=state.caches[index],
-            )
+            match_BNL = None if text.match_BKL is None else text.match_BKL.repeat(1, T, 1)
+            words = (text.keys_values[index], text.bias_B11L, match_BNL)
+            x_BNC, map_BhNL = layer(x_BNC, bias, *words, newest, state.caches[index])
             maps.append(map_BhNL[:, :, -K:])
         return x_BNC.unflatten(1, (T, K)), torch.stack(maps, dim=1)
 
@@ -116,12 +101,11 @@ class TextOCVPLayer(nn.Module):
         keys_values: tuple[Tensor, Tensor],
         text_bias: Tensor,
         match_BNL: Tensor | None,
-        *,
-        newest: int | None = None,
-        cache: KeyValueCache | None = None,
+        newest: int | None,
+        cache: KeyValueCache | None,
     ) -> tuple[Tensor, Tensor]:
         """The last `newest` tokens (default: all) after the layer, and their attention to the words (B, h, N, L)."""
-        attended_BNC = self.self_attention(self.norm_self(x_BMC), self_bias, newest=newest, cache=cache)
+        attended_BNC = self.self_attention(self.norm_self(x_BMC), self_bias, newest, cache)
         x_BNC = attended_BNC + (x_BMC if newest is None else x_BMC[:, -newest:])
         if match_BNL is not None and self.color_gain_h is not None:
             text_bias = text_bias + self.color_gain_h[:, None, None] * match_BNL[:, None]
