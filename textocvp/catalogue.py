@@ -103,7 +103,7 @@ def _entry(name: str, config: ModelConfig | MageConfig, bundled: bool) -> Entry:
         else:
             model = TextOCVP(config)
             whole, predictor = learnable(model), learnable(model.predictor)
-            if not model.predictor.hears_text:
+            if not model.predictor.uses_text:
                 whole -= learnable(model.text)
     needed = _frozen_encoders(config)
     state: State = "trained here" if bundled else "needs weights" if needed else "not trained here"

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.slots import SlotLayout
 
 C = TypeVar("C")
@@ -131,37 +132,10 @@ class TextConfig:
 
 
 @dataclass(frozen=True)
-class PredictorConfig:
-    """From slots and text to the slots of the next frame.
+class PredictorConfig(TextOCVPConfig):
+    """The options of every kind of predictor."""
 
-    Attributes:
-        kind: `textocvp` (published) or `ocvp-seq` (a baseline that hears no text: `layers` of object attention, then
-            time attention).
-        dim: token width. layers, heads, hidden: the transformer (`hidden` of every feed-forward net).
-        attention: `window` (published: bidirectional over the last `window` frames, recomputed each step) or
-            `causal` (each frame sees itself and its past; keys and values are cached).
-        window: the longest past, in frames. For `causal` also the longest rollout it can be trained or used for.
-        age_encoding: `learned` (published) or `sinusoidal`, one code per frame, the same for all its slots.
-        residual: predict the change of the slots instead of the slots (published).
-        color_bias: add the colour-matching term to the text-to-slot attention (needs the lexicon encoder and explicit
-            slot colours).
-        feed_forwards: feed-forward nets a layer: 2 as the authors' code, 1 as the text.
-        standardize: read and change content in units of its deviation over the training slots. Always done with
-            explicit slots; the published model does not.
-    """
-
-    kind: Literal["textocvp", "ocvp-seq"] = "textocvp"
-    dim: int = 512
-    layers: int = 8
-    heads: int = 8
-    hidden: int = 1024
-    attention: Literal["window", "causal"] = "window"
-    window: int = 10
-    age_encoding: Literal["learned", "sinusoidal"] = "learned"
-    residual: bool = True
-    color_bias: bool = False
-    feed_forwards: Literal[1, 2] = 2
-    standardize: bool = False
+    kind: Literal["textocvp", "ocvp-seq"] = "textocvp"  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

@@ -47,4 +47,4 @@ def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: P
     assert touched(model.parser) == touched(model.renderer) == []
     parts = {name.split(".")[0] for name in touched(model.predictor)}
     assert parts == {"slot_in", "layers", "slot_out", "ages"}
-    assert bool(touched(model.text)) == model.predictor.hears_text
+    assert bool(touched(model.text)) == model.predictor.uses_text

@@ -59,10 +59,9 @@ class PlaceAttention(nn.Module):
         offset_BKHW = dx_BKW.square()[:, :, None, :] + dy_BKH.square()[..., None]
         place_BKN = -self.place * torch.log1p(offset_BKHW).flatten(2)
 
-        is_background = state.presence > 1.5
-        things_BKN = (logits_BKN + place_BKN).masked_fill(state.presence < 0.5, float("-inf"))
+        things_BKN = (logits_BKN + place_BKN).masked_fill(state.is_unused, float("-inf"))
         canvas_BKN = torch.logaddexp(logits_BKN, torch.full_like(logits_BKN, -self.sharpness * self.stranger))
-        return torch.where(is_background, canvas_BKN, things_BKN).softmax(dim=1).view(B, -1, H, W)
+        return torch.where(state.is_background, canvas_BKN, things_BKN).softmax(dim=1).view(B, -1, H, W)
 
 
 class PlacedCorrector(nn.Module):
@@ -149,7 +148,7 @@ class PlacedTransition(nn.Module):
     def forward(self, state: SlotState) -> SlotState:
         """Where the slots (B, K) are expected in the next frame."""
         tokens = torch.cat([state.content, state.position, state.scale.log(), state.presence], dim=-1)
-        unused = state.presence[..., 0] < 0.5
+        unused = state.is_unused[..., 0]
         change = self.outputs(self.block(self.inputs(tokens), src_key_padding_mask=unused))
         content, position, log_scale = change.split([state.content.shape[-1], 2, 2], dim=-1)
         moves = state.is_thing
@@ -208,9 +207,8 @@ class PlacedParser(SceneParser):
         position, scale = moments(clusters.masks)
         presence = clusters.presence[..., None].clone()
         presence[:, 0] = PRESENCE_BACKGROUND
-        is_thing = (presence > 0.5) & (presence < 1.5)
+        state = SlotState(frames.new_zeros(B, K, self.layout.content), color, position, scale, presence)
         # The canvas fills the frame, an unused slot sits in its middle: constants, nothing to learn there.
-        position = torch.where(is_thing, position, torch.zeros_like(position))
-        scale = torch.where(is_thing, scale, torch.full_like(scale, 0.5))
-        content = frames.new_zeros(B, K, self.layout.content)
-        return self.corrector(frames, SlotState(content, color, position, scale, presence), clusters.masks)
+        state.position = torch.where(state.is_thing, position, torch.zeros_like(position))
+        state.scale = torch.where(state.is_thing, scale, torch.full_like(scale, 0.5))
+        return self.corrector(frames, state, clusters.masks)

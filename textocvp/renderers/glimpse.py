@@ -50,7 +50,7 @@ class GlimpseRenderer(Renderer):
         state = SlotState.split(slots, self.layout)
         logits_BKHW, shading_BKHW = self._pictures(state).unbind(2)
         masks_BKHW = self._compete(logits_BKHW, state)
-        is_background = (state.presence > 1.5)[..., None]  # (B, K, 1, 1)
+        is_background = state.is_background[..., None]  # (B, K, 1, 1)
         shading_BKHW = torch.where(is_background, self.canvas, shading_BKHW)
         light_BKHW = 1 + shading_BKHW
         rgb_BK3 = (state.color + 1) / 2
@@ -76,7 +76,6 @@ class GlimpseRenderer(Renderer):
         return paste(cells - offset, state.position, state.scale, self.size, self.size, self.extent) + offset
 
     def _compete(self, logits_BKHW: Tensor, state: SlotState) -> Tensor:
-        presence = state.presence[..., None]  # (B, K, 1, 1)
-        logits_BKHW = torch.where(presence > 0.5, logits_BKHW, torch.full_like(logits_BKHW, NOTHING))
-        logits_BKHW = torch.where(presence > 1.5, torch.zeros_like(logits_BKHW), logits_BKHW)
+        logits_BKHW = logits_BKHW.masked_fill(state.is_unused[..., None], NOTHING)
+        logits_BKHW = logits_BKHW.masked_fill(state.is_background[..., None], 0.0)
         return F.softmax(logits_BKHW, dim=1)
