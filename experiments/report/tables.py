@@ -1,0 +1,325 @@
+"""Tables of figures. One `TableSpec` gives the table in the terminal, in HTML and in Markdown, and its plot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from rich import box
+from rich.table import Table as RichTable
+
+from experiments.report.rows import Row, by_key
+
+DASH = "\u2013"
+Kind = Literal["ours", "baseline", "control", "ceiling", "paper"]
+_STYLES: dict[Kind, str] = {
+    "ours": "bold", "baseline": "", "control": "dim", "ceiling": "", "paper": "italic cyan",
+}  # fmt: skip
+LABEL = 24  # letters of a line's label in the terminal, before it is wrapped
+TERMINAL = 80  # columns of a terminal that does not say how wide it is
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure.
+
+    Attributes:
+        text: the figure.
+        interval: of 95 %, empty when there is none.
+        n: how many scenes it is from; None where nothing was measured.
+    """
+
+    text: str
+    interval: str = ""
+    n: int | None = None
+
+    @classmethod
+    def of(cls, row: Row | None, digits: int = 2, percent: bool = False) -> Cell:
+        """The cell of a row; a dash while there is none yet."""
+        if row is None:
+            return cls(DASH)
+        if percent:
+            low, high = (round(100 * end) + 0 for end in (row.low, row.high))
+            value, interval = as_percent(row.value), f"{low} to {high} %"
+        else:
+            between = " to " if row.low < 0 else DASH  # a dash beside a minus sign cannot be read
+            value = f"{row.value:.{digits}f}"
+            interval = f"{row.low:.{digits}f}{between}{row.high:.{digits}f}"
+        # A single scene has no interval.
+        return cls(value, "" if row.n < 2 else interval, row.n)
+
+    def small(self, with_n: bool) -> tuple[str, ...]:
+        """The small lines below the figure: its interval, and on demand its n."""
+        n = f"n = {self.n}" if with_n and self.n else ""
+        return tuple(part for part in (self.interval, n) if part)
+
+
+def as_percent(share: float) -> str:
+    """`6.4 %` for 0.064."""
+    return f"{round(100 * share, 1) + 0.0:.1f} %"  # + 0 turns a negative zero round
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One line of a table: its label, its cells, its part in the argument, and how it was measured."""
+
+    label: str
+    cells: Sequence[Cell]
+    kind: Kind = "ours"
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Title, columns and rows. Every row has one cell a column.
+
+    Raises:
+        ValueError: if a row has more or fewer.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[TableRow] = field(default_factory=list)
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row.cells) != len(self.columns):
+                raise ValueError(
+                    f"row {row.label!r} has {len(row.cells)} cells, the table {len(self.columns)} columns"
+                )
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Every n of its figures, sorted. With one only, the caption says it; otherwise each figure does."""
+        return tuple(sorted({cell.n for row in self.rows for cell in row.cells if cell.n}))
+
+    @property
+    def full_caption(self) -> str:
+        """The caption, with the n of all figures where that is the same."""
+        n = f"n = {self.counts[0]}." if len(self.counts) == 1 else ""
+        return " ".join(part for part in (self.caption, n) if part)
+
+    def to_terminal(self, width: int = TERMINAL, intervals: bool = True) -> list[RichTable]:
+        """For the terminal. Columns for which a line is too narrow follow below, so that no figure is cut off.
+
+        Args:
+            width: of the terminal, in letters.
+            intervals: whether they stand below the figures.
+        """
+        with_n = len(self.counts) > 1
+        small = [[cell.small(with_n) if intervals else () for cell in row.cells] for row in self.rows]
+        label = min(LABEL, max((len(row.label) for row in self.rows), default=1))
+        least = []  # letters that a column needs: titles may be wrapped between words, figures may not
+        for c, column in enumerate(self.columns):
+            texts = [
+                t for row, below in zip(self.rows, small, strict=True) for t in (row.cells[c].text, *below[c])
+            ]
+            least.append(max(map(len, [*column.split(), *texts])))
+        room = (
+            width - (label + 2) - 2
+        )  # a column is followed by two letters, and the table has one at each side
+        blocks: list[list[int]] = [[]]
+        for c, wanted in enumerate(least):
+            if blocks[-1] and sum(least[k] + 2 for k in blocks[-1]) + wanted + 2 > room:
+                blocks.append([])
+            blocks[-1].append(c)
+        return [
+            self._block(some, least, small, label, room, first=some is blocks[0], last=some is blocks[-1])
+            for some in blocks
+        ]
+
+    def _block(
+        self,
+        some: Sequence[int],
+        least: Sequence[int],
+        small: Sequence[Sequence[tuple[str, ...]]],
+        label: int,
+        room: int,
+        *,
+        first: bool,
+        last: bool,
+    ) -> RichTable:
+        """Some of the columns as a table of their own."""
+        table = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left", title_style="bold")
+        table.title = self.title if first else None
+        table.caption, table.caption_justify, table.caption_style = None, "left", "dim"
+        if last and self.full_caption:
+            table.caption = self.full_caption
+        whole = {c: max(least[c], len(self.columns[c])) for c in some}
+        roomy = sum(wanted + 2 for wanted in whole.values()) <= room
+        table.add_column("", width=label)
+        for c in some:
+            table.add_column(self.columns[c], justify="right", width=whole[c] if roomy else least[c])
+        for row, below in zip(self.rows, small, strict=True):
+            cells = [
+                "\n".join([row.cells[c].text, *(f"[dim not bold not italic]{line}[/]" for line in below[c])])
+                for c in some
+            ]
+            table.add_row(row.label, *cells, style=_STYLES[row.kind])
+        return table
+
+    def to_markdown(self) -> str:
+        """For a page of text: lines and columns in which anything was measured."""
+        used = [
+            c for c in range(len(self.columns))
+            if any(row.cells[c].n or (row.kind == "paper" and row.cells[c].text != DASH) for row in self.rows)
+        ]  # fmt: skip
+        with_n = len(self.counts) > 1
+        title = self.title if with_n or not self.counts else f"{self.title}, n = {self.counts[0]}"
+        lines = [f"| {' | '.join([title, *(self.columns[c] for c in used)])} |"]
+        lines.append("|---" * (len(used) + 1) + "|")
+        for row in self.rows:
+            if all(row.cells[c].text == DASH for c in used):
+                continue
+            cells = []
+            for c in used:
+                small = ", ".join(row.cells[c].small(with_n)).replace(DASH, " to ")
+                cells.append(row.cells[c].text + (f" ({small})" if small else ""))
+            label = row.label.replace("|", "/")  # a bar would end the cell
+            lines.append(f"| {' | '.join([label, *cells])} |")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A line that the paper has.
+
+    Attributes:
+        label: of the line.
+        figures: (split, variant, metric) -> the paper's figure.
+        note: where it was measured.
+    """
+
+    label: str
+    figures: Mapping[tuple[str, str, str], float]
+    note: str = "CLIPort at 336x336, another camera"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """What a line of a table shows.
+
+    Attributes:
+        key: `method` of the rows that it shows.
+        kind: `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures.
+        note: how it was measured, in a few words.
+        hue: colour in every plot, an index into the themes' series.
+        label: its name; the key if empty.
+        metric: shows this metric instead of the columns' own.
+        digits: with so many digits instead of the columns' own.
+        paper: the paper's figures of the same, for a line below it.
+    """
+
+    key: str
+    kind: Kind = "ours"
+    note: str = ""
+    hue: int = 0
+    label: str = ""
+    metric: str = ""
+    digits: int | None = None
+    paper: Paper | None = None
+
+    @property
+    def name(self) -> str:
+        """How it is called in tables and plots."""
+        return self.label or self.key
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a column of a table shows: rows of one split, variant and metric.
+
+    Attributes:
+        title: at its head.
+        split: see `Row`.
+        variant: see `Row`.
+        metric: see `Row`.
+        digits: after the point.
+        percent: shown as `6.4 %`.
+    """
+
+    title: str
+    split: str
+    variant: str
+    metric: str
+    digits: int = 2
+    percent: bool = False
+
+
+def columns(metric: str, places: Mapping[str, tuple[str, str]], digits: int = 2) -> tuple[Column, ...]:
+    """A column for each place, all of one metric. Places: title -> (split, variant)."""
+    return tuple(Column(title, *place, metric, digits) for title, place in places.items())
+
+
+@dataclass(frozen=True)
+class TableSpec:
+    """A table that is filled from rows.
+
+    Attributes:
+        title: of the table.
+        columns: from left to right.
+        lines: from top to bottom.
+        caption: a sentence below.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    lines: Sequence[Line]
+    caption: str = ""
+
+    def table(self, rows: Iterable[Row], missing: Iterable[str] = ()) -> Table:
+        """The table, with a dash for what was not measured (yet).
+
+        Args:
+            rows: all rows of the study.
+            missing: methods that cannot be measured here; their lines say so.
+        """
+        found, missing = by_key(rows), set(missing)
+        lines = []
+        for line in self.lines:
+            note = "absent; the last section says why" if line.key in missing else line.note
+            cells = [self._cell(found, line, column) for column in self.columns]
+            lines.append(TableRow(line.name, cells, line.kind, note))
+            if (paper := line.paper) is not None:
+                quoted = [self._quoted(paper, line, column) for column in self.columns]
+                if any(value is not None for value in quoted):
+                    cells = [
+                        Cell(DASH if v is None else as_percent(v) if c.percent else f"{v:.{c.digits}f}")
+                        for v, c in zip(quoted, self.columns, strict=True)
+                    ]
+                    lines.append(TableRow(paper.label, cells, "paper", paper.note))
+        return Table(self.title, [column.title for column in self.columns], lines, self.caption)
+
+    def points(self, rows: Iterable[Row], line: Line) -> list[tuple[float, float, float] | None]:
+        """(value, low, high) of a line at each column, in percent where the column is; None without a row."""
+        found = by_key(rows)
+        points: list[tuple[float, float, float] | None] = []
+        for column in self.columns:
+            row = found.get(_key(line, column))
+            scale = 100 if column.percent else 1
+            points.append(None if row is None else (scale * row.value, scale * row.low, scale * row.high))
+        return points
+
+    def paper_points(self, line: Line) -> list[tuple[float, float, float] | None]:
+        """The same for the paper's figures, which have no interval."""
+        if line.paper is None:
+            return [None] * len(self.columns)
+        scaled = [
+            None if (v := self._quoted(line.paper, line, c)) is None else v * (100 if c.percent else 1)
+            for c in self.columns
+        ]
+        return [None if v is None else (v, v, v) for v in scaled]
+
+    def _cell(self, found: Mapping, line: Line, column: Column) -> Cell:
+        digits = column.digits if line.digits is None else line.digits
+        return Cell.of(found.get(_key(line, column)), digits, column.percent)
+
+    @staticmethod
+    def _quoted(paper: Paper, line: Line, column: Column) -> float | None:
+        return paper.figures.get((column.split, column.variant, line.metric or column.metric))
+
+
+def _key(line: Line, column: Column) -> tuple[str, str, str, str]:
+    return line.key, column.split, column.variant, line.metric or column.metric
