@@ -220,11 +220,11 @@ def units(run: Run) -> dict[str, Part]:
                     episode = LoopEpisode(method, scene, variant, variants, seed)
                     (single if scene.steps == 1 else long).append(episode)
     return {
-        "predicted study": Part([PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes], 2.6),
-        "closed loop": Part(single, 0.8),
-        "long goals": Part(long, 5.0),
-        "pictures": Part(seconds=1.5, count=4 * sizes.clips),
-        "attention": Part(seconds=0.5, count=1),
+        "predicted study": Part([PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes], 0.8),
+        "closed loop": Part(single, 0.25),
+        "long goals": Part(long, 0.9),
+        "pictures": Part(seconds=0.5, count=4 * sizes.clips),
+        "attention": Part(seconds=0.3, count=1),
     }
 
 

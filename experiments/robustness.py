@@ -162,10 +162,10 @@ def units(run: Run) -> dict[str, Part]:
         if method in ("ours", "expert") or i < sizes.controls
     ]
     return {
-        "frames and masks": Part(scenes, 4.0),
-        "closed loop": Part(episodes, 0.8),
-        "imagined clips": Part(seconds=2.0, count=2 * min(sizes.clips, sizes.imagined)),
-        "robot clips": Part(seconds=1.5, count=sizes.acted),
+        "frames and masks": Part(scenes, 2.8),
+        "closed loop": Part(episodes, 0.25),
+        "imagined clips": Part(seconds=1.4, count=2 * min(sizes.clips, sizes.imagined)),
+        "robot clips": Part(seconds=0.3, count=sizes.acted),
     }
 
 
@@ -457,6 +457,14 @@ LOOP_TABLE = TableSpec(
     columns("closed_loop_success", {name: (split, WHOLE) for split, name in SPLITS.items()}),
     lines(ACTING),
 )
+SHORT_TABLES = [
+    TableSpec(
+        f"{METRICS[metric]} of {SHORT}",
+        [c for split, name in SPLITS.items() for c in _with_drops(split, [(name, SHORT, metric, 3)])],
+        FRAME_LINES,
+    )
+    for metric in ("ssim", *DISTANCES)
+]
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
@@ -541,7 +549,8 @@ STUDY = Study(
     units=units,
     cases=cases,
     rows=rows,
-    tables=[table for split in SPLITS for table in (FRAME_TABLES[split], MASK_TABLES[split])],
+    tables=[*SHORT_TABLES, LOOP_TABLE],
+    printed=lambda run, results: [bars_table(results, run.measures)],
     page=page,
     cards=cards,
     headline=headline,

@@ -16,9 +16,9 @@ from experiments.report.tables import TERMINAL, Table
 
 T = TypeVar("T")
 # A declared time counts as much as so many measured units of the same part.
-TRUST_UNITS = 3.0
+TRUST_UNITS = 2.0
 # The declared times of all parts together count as much as so many seconds of measured work.
-TRUST_SECONDS = 10.0
+TRUST_SECONDS = 5.0
 
 
 @dataclass

@@ -101,6 +101,17 @@ class Table:
         n = f"n = {self.counts[0]}." if len(self.counts) == 1 else ""
         return " ".join(part for part in (self.caption, n) if part)
 
+    def measured(self, columns: Sequence[int] | None = None) -> tuple[list[int], list[int]]:
+        """Columns (of the given ones) with a figure that is not the paper's, and rows with any figure in them."""
+
+        def there(r: int, c: int) -> bool:
+            return self.rows[r].cells[c].text not in (DASH, "")
+
+        rows = range(len(self.rows))
+        columns = range(len(self.columns)) if columns is None else columns
+        used = [c for c in columns if any(there(r, c) and self.rows[r].kind != "paper" for r in rows)]
+        return used, [r for r in rows if any(there(r, c) for c in used)]
+
     def to_terminal(self, width: int = TERMINAL, intervals: bool = True) -> list[RichTable]:
         """For the terminal. Columns for which a line is too narrow follow below, so that no figure is cut off.
 
@@ -108,71 +119,63 @@ class Table:
             width: of the terminal, in letters.
             intervals: whether they stand below the figures.
         """
-        with_n = len(self.counts) > 1
-        small = [[cell.small(with_n) if intervals else () for cell in row.cells] for row in self.rows]
+        used = self.measured()[0] or list(range(len(self.columns)))
         label = min(LABEL, max((len(row.label) for row in self.rows), default=1))
-        least = []  # letters that a column needs: titles may be wrapped between words, figures may not
-        for c, column in enumerate(self.columns):
-            texts = [
-                t for row, below in zip(self.rows, small, strict=True) for t in (row.cells[c].text, *below[c])
-            ]
-            least.append(max(map(len, [*column.split(), *texts])))
-        room = (
-            width - (label + 2) - 2
-        )  # a column is followed by two letters, and the table has one at each side
+        # A column is followed by two letters, and the table has one at each side.
+        room = width - (label + 2) - 2
+        shown = {c: self._column(c, intervals) for c in used}
         blocks: list[list[int]] = [[]]
-        for c, wanted in enumerate(least):
-            if blocks[-1] and sum(least[k] + 2 for k in blocks[-1]) + wanted + 2 > room:
+        for c in used:
+            if blocks[-1] and sum(shown[k][1] + 2 for k in [*blocks[-1], c]) > room:
                 blocks.append([])
             blocks[-1].append(c)
-        return [
-            self._block(some, least, small, label, room, first=some is blocks[0], last=some is blocks[-1])
-            for some in blocks
-        ]
+        tables = []
+        for some in blocks:
+            table = RichTable(
+                box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left", title_style="bold"
+            )
+            table.title = self.title if some is blocks[0] else None
+            table.caption, table.caption_justify, table.caption_style = None, "left", "dim"
+            if some is blocks[-1] and self.full_caption:
+                table.caption = self.full_caption
+            whole = {c: max(shown[c][1], len(self.columns[c])) for c in some}
+            roomy = sum(wanted + 2 for wanted in whole.values()) <= room
+            table.add_column("", width=label)
+            for c in some:
+                table.add_column(shown[c][0], justify="right", width=whole[c] if roomy else shown[c][1])
+            for r in self.measured(some)[1] or range(len(self.rows)):
+                row = self.rows[r]
+                table.add_row(row.label, *(shown[c][2][r] for c in some), style=_STYLES[row.kind])
+            tables.append(table)
+        return tables
 
-    def _block(
-        self,
-        some: Sequence[int],
-        least: Sequence[int],
-        small: Sequence[Sequence[tuple[str, ...]]],
-        label: int,
-        room: int,
-        *,
-        first: bool,
-        last: bool,
-    ) -> RichTable:
-        """Some of the columns as a table of their own."""
-        table = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left", title_style="bold")
-        table.title = self.title if first else None
-        table.caption, table.caption_justify, table.caption_style = None, "left", "dim"
-        if last and self.full_caption:
-            table.caption = self.full_caption
-        whole = {c: max(least[c], len(self.columns[c])) for c in some}
-        roomy = sum(wanted + 2 for wanted in whole.values()) <= room
-        table.add_column("", width=label)
-        for c in some:
-            table.add_column(self.columns[c], justify="right", width=whole[c] if roomy else least[c])
-        for row, below in zip(self.rows, small, strict=True):
-            cells = [
-                "\n".join([row.cells[c].text, *(f"[dim not bold not italic]{line}[/]" for line in below[c])])
-                for c in some
-            ]
-            table.add_row(row.label, *cells, style=_STYLES[row.kind])
-        return table
+    def _column(self, c: int, intervals: bool) -> tuple[str, int, list[str]]:
+        """Heading of a column, the letters that it needs, and its cells; titles may be wrapped between words."""
+        counts = {n for row in self.rows if (n := row.cells[c].n)}
+        alike = len(counts) == 1
+        small = [
+            row.cells[c].small(len(self.counts) > 1 and not alike) if intervals else () for row in self.rows
+        ]
+        heading = self.columns[c]
+        letters = [*heading.split(), *(row.cells[c].text for row in self.rows)]
+        letters += [text for texts in small for text in texts]
+        if intervals and alike and len(self.counts) > 1:
+            heading += f"\nn = {min(counts)}"
+            letters.append(f"n = {min(counts)}")
+        cells = [
+            "\n".join([row.cells[c].text, *(f"[dim not bold not italic]{text}[/]" for text in texts)])
+            for row, texts in zip(self.rows, small, strict=True)
+        ]
+        return heading, max(map(len, letters)), cells
 
     def to_markdown(self) -> str:
         """For a page of text: lines and columns in which anything was measured."""
-        used = [
-            c for c in range(len(self.columns))
-            if any(row.cells[c].n or (row.kind == "paper" and row.cells[c].text != DASH) for row in self.rows)
-        ]  # fmt: skip
+        used, measured = self.measured()
         with_n = len(self.counts) > 1
         title = self.title if with_n or not self.counts else f"{self.title}, n = {self.counts[0]}"
         lines = [f"| {' | '.join([title, *(self.columns[c] for c in used)])} |"]
         lines.append("|---" * (len(used) + 1) + "|")
-        for row in self.rows:
-            if all(row.cells[c].text == DASH for c in used):
-                continue
+        for row in (self.rows[r] for r in measured):
             cells = []
             for c in used:
                 small = ", ".join(row.cells[c].small(with_n)).replace(DASH, " to ")

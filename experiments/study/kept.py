@@ -13,7 +13,7 @@ import ast
 import hashlib
 import os
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -98,14 +98,8 @@ def code_digest() -> str:
 def bare_code(source: str) -> str:
     """The syntax of a module without docstrings."""
     tree = ast.parse(source)
-    for node in _documented(tree):
-        node.body = node.body[1:]
-    return ast.dump(tree)
-
-
-def _documented(tree: ast.Module) -> Iterator[Any]:
-    """What has a docstring."""
     for node in ast.walk(tree):
         documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
-        if documented and ast.get_docstring(node, clean=False) is not None:
-            yield node
+        if documented and ast.get_docstring(node, clean=False) is not None:  # type: ignore[arg-type]
+            node.body = node.body[1:]  # type: ignore[attr-defined]
+    return ast.dump(tree)

@@ -164,6 +164,7 @@ class Study:
         inputs: files whose content changes figures, beside the checkpoints of `methods`.
         versions: more entries of `versions` in results.json.
         files: more files of the folder: name -> text.
+        printed: more tables, that are printed after the others.
         check: raises UsageError if the model does not do.
         one_process: whether everything runs in this process, as for timing.
         again: how far the figures come out the same.
@@ -188,6 +189,7 @@ class Study:
     inputs: Callable[[Any], Sequence[Path]] = lambda args: ()
     versions: Callable[[Run], Mapping[str, str]] = lambda run: {}
     files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}
+    printed: Callable[[Run, Results], Sequence[Table]] = lambda run, results: ()
     check: Callable[[Run], None] = lambda run: None
     one_process: bool = False
     again: str = (
@@ -374,7 +376,7 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
         done = True
     finally:
         kept.close(done=done)
-    progress.print(*this.tables(rows))
+    progress.print(*this.tables(rows), *study.printed(this, results))
     for remark in this.remarks:
         progress.console.print(remark, markup=False, highlight=False)
     progress.console.print(f"{results.seconds:.0f} s. Report: {this.folder.path / 'report.html'}")
@@ -413,8 +415,9 @@ def _write(this: Run, results: Results, found: Found) -> None:
 
 
 def _note_seeds(seeds: dict[str, list[int]], part: str, units: Sequence[Unit[Any]]) -> None:
-    """Every scene's seed, by what it was used for."""
+    """Every scene's seed, by what it was used for, and the slot seeds of units that have several."""
     for unit in units:
+        seeds["slots"] += [seed for seed in getattr(unit, "slot_seeds", ()) if seed not in seeds["slots"]]
         scene = getattr(unit, "scene", None)
         if scene is not None:
             known = seeds.setdefault(f"{part}, {scene.split}", [])
