@@ -165,7 +165,7 @@ class Study:
         versions: more entries of `versions` in results.json.
         files: more files of the folder: name -> text.
         printed: more tables, that are printed after the others.
-        check: raises UsageError if the model does not do.
+        prepare: makes what the study needs once, `Run.prepared`; raises UsageError if the model does not do.
         one_process: whether everything runs in this process, as for timing.
         again: how far the figures come out the same.
     """
@@ -190,7 +190,7 @@ class Study:
     versions: Callable[[Run], Mapping[str, str]] = lambda run: {}
     files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}
     printed: Callable[[Run, Results], Sequence[Table]] = lambda run, results: ()
-    check: Callable[[Run], None] = lambda run: None
+    prepare: Callable[[Run], Any] = lambda run: None
     one_process: bool = False
     again: str = (
         "The seed fixes scenes, instructions and slots: "
@@ -214,6 +214,7 @@ class Run:
         world_model: a world model to look at; units get their own.
         models: of the methods, as far as they are there.
         missing: methods that cannot be measured, and why.
+        prepared: what `Study.prepare` made.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -252,7 +253,7 @@ class Run:
             loads = {key: LoadCheckpoint(name) for key, name in named.items()}
         self.models, self.missing = find_models(loads)
         self._measures = measures
-        study.check(self)
+        self.prepared = study.prepare(self)
 
     @cached_property
     def measures(self) -> Measures:
