@@ -53,25 +53,15 @@ FARTHEST = 64  # pixels along a side of the frame
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured, in scenes.
+    """How much is measured, in scenes."""
 
-    Attributes:
-        predicted: of the predicted study.
-        slot_seeds: slot-sampling seeds of each of them.
-        loop: of each column of the closed loop with the controllability scenes, for ours and the expert.
-        other: of each other column with goals of one step.
-        long: of each column with longer goals.
-        controls: at most this many in any column for every other method.
-        clips: how many best and how many worst cases the report shows.
-    """
-
-    predicted: int
-    slot_seeds: int
-    loop: int
-    other: int
-    long: int
-    controls: int
-    clips: int
+    predicted: int  # of the predicted study
+    slot_seeds: int  # slot-sampling seeds of each of them
+    loop: int  # of each column of the closed loop with the controllability scenes, for ours and the expert
+    other: int  # of each other column with goals of one step
+    long: int  # of each column with longer goals
+    controls: int  # at most this many in any column for every other method
+    clips: int  # how many best and how many worst cases the report shows
 
     def scenes(self, split: str, method: str) -> int:
         """How many scenes of a split a method plays."""
@@ -92,24 +82,16 @@ FULL = Sizes(predicted=100, slot_seeds=5, loop=100, other=100, long=100, control
 
 @dataclass(frozen=True, eq=False)
 class PredictedOutcome:
-    """Everything that was judged in one scene.
+    """Everything that was judged in one scene."""
 
-    Attributes:
-        scene: which.
-        texts: its V instructions, original first.
-        verdicts: method -> its verdicts. `wrong text` is judged for another instruction than it was imagined with;
-            `copy frame` is the first frame repeated; `true frames` is the parser on the expert's motion, S = 1.
-        expert_V: whether the expert reached the goal, judged by the simulator.
-        imagined_TV: block to bowl distance in pixels over time for the first slot seed.
-        true_TV: the same of the true frames.
-    """
-
-    scene: StudyScene
-    texts: tuple[str, ...]
+    scene: StudyScene  # which
+    texts: tuple[str, ...]  # its V instructions, original first
+    # method -> its verdicts. `wrong text` is judged for another instruction than it was imagined with; `copy
+    # frame` is the first frame repeated; `true frames` is the parser on the expert's motion, S = 1.
     verdicts: Mapping[str, Verdicts]
-    expert_V: np.ndarray
-    imagined_TV: np.ndarray
-    true_TV: np.ndarray
+    expert_V: np.ndarray  # whether the expert reached the goal, judged by the simulator
+    imagined_TV: np.ndarray  # block to bowl distance in pixels over time for the first slot seed
+    true_TV: np.ndarray  # the same of the true frames
 
 
 @dataclass(frozen=True)

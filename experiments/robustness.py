@@ -26,14 +26,8 @@ from experiments.report.rows import Key, Row, interval_row, mean_row, rate_row
 from experiments.report.tables import DASH, Cell, Column, Table, TableRow, TableSpec, as_percent, columns
 from experiments.study.clips import PredictionClip, best_and_worst, episode_clips, extreme_clips
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome
-from experiments.study.frame_metrics import (
-    METRICS,
-    PERCEPTUAL,
-    FrameScores,
-    Measures,
-    Scorer,
-    available_measures,
-)
+from experiments.study.frame_metrics import METRICS, PERCEPTUAL, FrameScores, Measures, Scorer
+from experiments.study.frame_metrics import available_measures as available
 from experiments.study.judge import judge_rollout
 from experiments.study.mask_metrics import labels_of, score_masks
 from experiments.study.methods import BASELINES, HORIZON, METHODS, PLANNERS, TRAINED_LITTLE, Model, lines
@@ -63,21 +57,13 @@ MASK_LINES = lines(["ours", REPARSED, *IMAGINING[1:], *ACTING[1:]])
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured, in scenes of each split.
+    """How much is measured, in scenes of each split."""
 
-    Attributes:
-        imagined: for frames and masks.
-        loop: for the closed loop, ours and the expert.
-        controls: for every other planner.
-        clips: how many best and how many worst cases are shown.
-        acted: how many episodes of the robot are shown.
-    """
-
-    imagined: int
-    loop: int
-    controls: int
-    clips: int
-    acted: int
+    imagined: int  # for frames and masks
+    loop: int  # for the closed loop, ours and the expert
+    controls: int  # for every other planner
+    clips: int  # how many best and how many worst cases are shown
+    acted: int  # how many episodes of the robot are shown
 
 
 QUICK = Sizes(imagined=5, loop=8, controls=4, clips=3, acted=2)
@@ -95,18 +81,13 @@ def sizes_of(args: ScenesArgs) -> Sizes:
 
 @dataclass(frozen=True, eq=False)
 class RobustOutcome:
-    """One scene, imagined by everybody and measured.
+    """One scene, imagined by everybody and measured."""
 
-    Attributes:
-        scene: which.
-        scores: of each prediction's frames.
-        ious: method -> (t,), mask IoU of the blocks and bowls that are seen, frame by frame (Hungarian).
-        success: method -> whether its masks show what the sentence says; methods that look 24 frames ahead.
-    """
-
-    scene: StudyScene
-    scores: tuple[FrameScores, ...]
+    scene: StudyScene  # which
+    scores: tuple[FrameScores, ...]  # of each prediction's frames
+    # method -> (t,), mask IoU of the blocks and bowls that are seen, frame by frame (Hungarian)
     ious: Mapping[str, np.ndarray]
+    # method -> whether its masks show what the sentence says; methods that look 24 frames ahead
     success: Mapping[str, bool]
 
     def mean(self, method: str, metric: str, length: int) -> float | None:
@@ -171,14 +152,10 @@ def units(run: Run) -> dict[str, Part]:
 
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """The best and worst imagined scenes, and episodes of the robot."""
-    return {
-        "imagined clips": imagined_clips(
-            found["frames and masks"], run.models, run.measures, run.args.seed, run.sizes.clips
-        ),
-        "robot clips": episode_clips(
-            found["closed loop"], lambda episode: SPLITS[episode.scene.split], run.sizes.acted // 2
-        ),
-    }
+    imagined, acted = found["frames and masks"], found["closed loop"]
+    clips = imagined_clips(imagined, run.models, run.measures, run.args.seed, run.sizes.clips)
+    robot = episode_clips(acted, lambda episode: SPLITS[episode.scene.split], run.sizes.acted // 2)
+    return {"imagined clips": clips, "robot clips": robot}
 
 
 def imagined_clips(
@@ -208,27 +185,27 @@ def imagined_clips(
 
 @dataclass(frozen=True, eq=False)
 class Figures:
-    """One figure of one method on every split: its rows, and how far it falls.
+    """One figure of one method on every split: its rows, and how far it falls."""
 
-    Attributes:
-        method: see `Row`.
-        variant: see `Row`.
-        metric: see `Row`.
-        values: split -> (N,), one value a scene.
-    """
+    method: str  # see `Row`
+    variant: str  # see `Row`
+    metric: str  # see `Row`
+    values: Mapping[str, np.ndarray]  # split -> (N,), one value a scene
 
-    method: str
-    variant: str
-    metric: str
-    values: Mapping[str, np.ndarray]
+    @classmethod
+    def of(
+        cls, method: str, variant: str, metric: str, values: Sequence[tuple[str, float | None]]
+    ) -> Figures:
+        """Of (split, value) a scene; None where it was not measured."""
+        by_split = {split: [v for one, v in values if one == split and v is not None] for split in SPLITS}
+        arrays = {split: np.asarray(its, dtype=np.float64) for split, its in by_split.items() if its}
+        return cls(method, variant, metric, arrays)
 
     def rows(self) -> list[Row]:
         """A row for each split, and one with the drop for each split that the model was not trained for."""
         make = rate_row if self.metric.endswith("success") else mean_row
         rows = [
-            make(self.method, split, self.variant, self.metric, values)
-            for split, values in self.values.items()
-            if len(values)
+            make(self.method, split, self.variant, self.metric, its) for split, its in self.values.items()
         ]
         for split in SHIFTED:
             if (found := self.drop(split)) is not None:
@@ -292,21 +269,14 @@ def difference_rows(figures: Sequence[Figures]) -> list[Row]:
 
 def imagined_figures(outcomes: Sequence[RobustOutcome], metrics: Sequence[str]) -> list[Figures]:
     """Frames and masks: `metrics` and mask IoU at both lengths, predicted success."""
-    by_split = {split: [o for o in outcomes if o.scene.split == split] for split in SPLITS}
     figures = []
     for method in dict.fromkeys(method for outcome in outcomes for method in outcome.ious):
         for metric in (*metrics, "iou"):
             for length in LENGTHS:
-                found = {
-                    split: [v for o in mine if (v := o.mean(method, metric, length)) is not None]
-                    for split, mine in by_split.items()
-                }
-                figures.append(_figures(method, f"{length} frames", metric, found))
-        judged = {
-            split: [o.success[method] for o in mine if method in o.success]
-            for split, mine in by_split.items()
-        }
-        figures.append(_figures(method, WHOLE, "predicted_success", judged))
+                means = [(o.scene.split, o.mean(method, metric, length)) for o in outcomes]
+                figures.append(Figures.of(method, f"{length} frames", metric, means))
+        judged = [(o.scene.split, o.success.get(method)) for o in outcomes]
+        figures.append(Figures.of(method, WHOLE, "predicted_success", judged))
     return figures
 
 
@@ -314,15 +284,9 @@ def loop_figures(outcomes: Sequence[LoopOutcome]) -> list[Figures]:
     """Success of the robot, judged by the simulator."""
     figures = []
     for method in ACTING:
-        mine = [o for o in outcomes if o.episode.method == method]
-        found = {split: [o.success for o in mine if o.episode.scene.split == split] for split in SPLITS}
-        figures.append(_figures(method, WHOLE, "closed_loop_success", found))
+        won = [(o.episode.scene.split, o.success) for o in outcomes if o.episode.method == method]
+        figures.append(Figures.of(method, WHOLE, "closed_loop_success", won))
     return figures
-
-
-def _figures(method: str, variant: str, metric: str, values: Mapping[str, Sequence[float]]) -> Figures:
-    arrays = {split: np.asarray(its, dtype=np.float64) for split, its in values.items() if len(its)}
-    return Figures(method, variant, metric, arrays)
 
 
 def rows(run: Run, found: Found) -> list[Row]:
@@ -348,19 +312,12 @@ def headline(run: Run) -> dict[str, Key]:
 
 @dataclass(frozen=True)
 class Bar:
-    """What the study is held to. Reported, never tuned for.
+    """What the study is held to. Reported, never tuned for."""
 
-    Attributes:
-        name: of the headline figure.
-        title: in words.
-        split: the scenes.
-        least: the least success; or None for a drop that must be smaller than MAGE's.
-    """
-
-    name: str
-    title: str
-    split: str
-    least: float | None = None
+    name: str  # of the headline figure
+    title: str  # in words
+    split: str  # the scenes
+    least: float | None = None  # the least success; or None for a drop that must be smaller than MAGE's
 
 
 BARS = (
@@ -472,7 +429,12 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     figures, missing, measures = list(results.rows), run.missing_keys, run.measures
     name = METRICS[measures.main]
     drops = TableSpec(
-        "", [Column(SPLITS[s], s, SHORT, f"{measures.main}_drop", percent=True) for s in SHIFTED], FRAME_LINES
+        "",
+        [
+            Column(SPLITS[s], s, SHORT, f"{measures.main}_drop", percent=True, paper="lpips_drop")
+            for s in SHIFTED
+        ],
+        FRAME_LINES,
     )
     bars = Section(
         "The bars",
@@ -545,7 +507,7 @@ STUDY = Study(
     sizes=sizes_of,
     horizon=HORIZON,
     methods=(*IMAGINING, *ACTING),
-    measures=lambda args: available_measures(),
+    measures=lambda args: available(),
     units=units,
     cases=cases,
     rows=rows,

@@ -14,48 +14,33 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from experiments.report.results import Checkpoint, Results
 from experiments.report.tables import DASH, Cell, Column, Line, Table
 
+AGAIN = "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
 Tone = Literal["good", "bad", "plain"]
 
 
 @dataclass(frozen=True)
 class Card:
-    """One headline figure.
+    """One headline figure."""
 
-    Attributes:
-        label, value: what it is, and the figure as text.
-        detail: a line below it: the interval, the number of scenes.
-        compare: what to read it against, as `paper .83` or `must be near 0`.
-        share: 0..1 for the small bar below the figure; None for no bar.
-        control: a control row: its bar is drawn in grey, because long is not good there.
-    """
-
-    label: str
+    label: str  # what it is, and the figure as text
     value: str
-    detail: str = ""
-    compare: str = ""
-    share: float | None = None
-    control: bool = False
+    detail: str = ""  # a line below it: the interval, the number of scenes
+    compare: str = ""  # what to read it against, as `paper .83` or `must be near 0`
+    share: float | None = None  # 0..1 for the small bar below the figure; None for no bar
+    control: bool = False  # a control row: its bar is drawn in grey, because long is not good there
 
 
 @dataclass(frozen=True)
 class CardSpec:
-    """A card that is filled from the rows.
+    """A card that is filled from the rows."""
 
-    Attributes:
-        label: what the figure is.
-        line: whose figure.
-        column: which figure.
-        compare: what to read it against: words, or what makes them of the results. By default the paper's figure.
-        bar: whether a share is drawn as a small bar.
-        each: what was counted.
-    """
-
-    label: str
-    line: Line
-    column: Column
+    label: str  # what the figure is
+    line: Line  # whose figure
+    column: Column  # which figure
+    # what to read it against: words, or what makes them of the results. By default the paper's figure.
     compare: str | Callable[[Results], str] = ""
-    bar: bool = True
-    each: str = "scenes"
+    bar: bool = True  # whether a share is drawn as a small bar
+    each: str = "scenes"  # what was counted
 
     def fill(self, results: Results) -> Card:
         """The card, with a dash where nothing was measured."""
@@ -75,41 +60,26 @@ class CardSpec:
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot, drawn once for light and once for dark pages.
+    """A plot, drawn once for light and once for dark pages."""
 
-    Attributes:
-        name: file name of the saved PNG.
-        light, dark: PNG files.
-        alt: what a reader who cannot see it needs to know. caption: a line below it.
-        wide: of many small panels, which need the width of the page.
-    """
-
-    name: str
-    light: bytes
+    name: str  # file name of the saved PNG
+    light: bytes  # PNG files
     dark: bytes
-    alt: str
-    caption: str = ""
-    wide: bool = False
+    alt: str  # what a reader who cannot see it needs to know
+    caption: str = ""  # a line below it
+    wide: bool = False  # of many small panels, which need the width of the page
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One animation of panels in a grid.
+    """One animation of panels in a grid."""
 
-    Attributes:
-        name: file name of the saved GIF.
-        gif: its bytes.
-        panels: what the columns of equal width show, from left to right.
-        title, caption: a heading, and a line of details.
-        badge: a short label; `tone` is its colour.
-    """
-
-    name: str
-    gif: bytes
-    panels: Sequence[str]
-    title: str
+    name: str  # file name of the saved GIF
+    gif: bytes  # its bytes
+    panels: Sequence[str]  # what the columns of equal width show, from left to right
+    title: str  # a heading, and a line of details
     caption: str = ""
-    badge: str = ""
+    badge: str = ""  # a short label; `tone` is its colour
     tone: Tone = "plain"
 
 
@@ -131,28 +101,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A whole report.
+    """A whole report."""
 
-    Attributes:
-        title: the study.
-        question: one sentence: what the study asks.
-        results: its figures; they give the versions, the seeds and the checkpoint's hash.
-        cards: headline figures.
-        sections: the rest.
-        command: what to type to get the same figures again.
-        again: how far they will be the same.
-    """
-
-    title: str
-    question: str
-    results: Results
-    cards: Sequence[Card]
-    sections: Sequence[Section]
-    command: str
-    again: str = (
-        "The seed fixes scenes, instructions and slots: "
-        "everything in results.json but the seconds comes out the same."
-    )
+    title: str  # the study
+    question: str  # one sentence: what the study asks
+    results: Results  # its figures; they give the versions, the seeds and the checkpoint's hash
+    cards: Sequence[Card]  # headline figures
+    sections: Sequence[Section]  # the rest
+    command: str  # what to type to get the same figures again
+    again: str = AGAIN  # how far they will be the same
 
     def to_html(self) -> str:
         """The page, with every image inside it."""
@@ -177,48 +134,28 @@ class Report:
 
 @dataclass(frozen=True)
 class Entry:
-    """One study on the index page.
+    """One study on the index page."""
 
-    Attributes:
-        title: of the study.
-        question: of the study.
-        state: a word or two, as `done` or `failed`.
-        tone: colour of the state.
-        detail: a line below: how long it took, how many figures it has.
-        figures: a few headline figures, (name, value as text).
-        report: where its page is, relative to the index; empty if there is none.
-        problem: what went wrong, or empty.
-    """
-
-    title: str
-    question: str
-    state: str
-    tone: Tone
-    detail: str = ""
-    figures: Sequence[tuple[str, str]] = ()
-    report: str = ""
-    problem: str = ""
+    title: str  # of the study
+    question: str  # of the study
+    state: str  # a word or two, as `done` or `failed`
+    tone: Tone  # colour of the state
+    detail: str = ""  # a line below: how long it took, how many figures it has
+    figures: Sequence[tuple[str, str]] = ()  # a few headline figures, (name, value as text)
+    report: str = ""  # where its page is, relative to the index; empty if there is none
+    problem: str = ""  # what went wrong, or empty
 
 
 @dataclass(frozen=True)
 class Index:
-    """The page that links every report.
+    """The page that links every report."""
 
-    Attributes:
-        title: its heading.
-        text: a sentence below.
-        entries: the studies, in order.
-        checkpoint: that they measured.
-        command: what to type to get them again.
-        quick: whether these were quick runs.
-    """
-
-    title: str
-    text: str
-    entries: Sequence[Entry]
-    checkpoint: Checkpoint
-    command: str
-    quick: bool
+    title: str  # its heading
+    text: str  # a sentence below
+    entries: Sequence[Entry]  # the studies, in order
+    checkpoint: Checkpoint  # that they measured
+    command: str  # what to type to get them again
+    quick: bool  # whether these were quick runs
 
     def to_html(self) -> str:
         """The page; only the links to the reports lead out of it."""

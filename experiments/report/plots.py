@@ -44,19 +44,13 @@ DARK = Theme(
 
 @dataclass(frozen=True)
 class Series:
-    """One series of figures with intervals, one entry a group; None where it was not measured.
+    """One series of figures with intervals, one entry a group; None where it was not measured."""
 
-    Attributes:
-        label: its name in the legend.
-        points: (value, low, high) a group. For a figure without an interval low = value = high.
-        hollow: drawn as a ring: figures quoted from elsewhere.
-        color: index into the theme's colours; its place among the series if None.
-    """
-
-    label: str
+    label: str  # its name in the legend
+    # (value, low, high) a group. For a figure without an interval low = value = high.
     points: Sequence[tuple[float, float, float] | None]
-    hollow: bool = False
-    color: int | None = None
+    hollow: bool = False  # drawn as a ring: figures quoted from elsewhere
+    color: int | None = None  # index into the theme's colours; its place among the series if None
 
 
 def interval_plot(
@@ -67,14 +61,16 @@ def interval_plot(
     label: str,
     caption: str = "",
     limits: tuple[float, float] | None = (0.0, 1.0),
-    bar: float | None = None,
 ) -> Figure:
     """Dots with 95 % intervals, groups from top to bottom.
 
     Args:
         name: file name, with `.png`.
-        groups: one name a group. series: their figures.
-        label: of the axis. limits: its ends, or None for automatic ones. bar: a value to mark with a line.
+        groups: one name a group.
+        series: their figures.
+        label: of the axis.
+        caption: below the plot.
+        limits: ends of the axis, or None for automatic ones.
     """
 
     def draw(axes: Axes, theme: Theme) -> None:
@@ -87,14 +83,8 @@ def interval_plot(
                 if point is None:
                     continue
                 value, low, high = point
-                axes.plot(
-                    [low, high],
-                    [g + offset] * 2,
-                    color=color,
-                    linewidth=2,
-                    alpha=0.55,
-                    solid_capstyle="round",
-                )
+                at = [g + offset] * 2
+                axes.plot([low, high], at, color=color, linewidth=2, alpha=0.55, solid_capstyle="round")
                 axes.plot(
                     value, g + offset, "o", markersize=6, color=color, markeredgewidth=1.6,
                     markerfacecolor=theme.page if one.hollow else color, label=None if named else one.label,
@@ -103,8 +93,6 @@ def interval_plot(
                 named = True
         for g in range(1, len(groups)):
             axes.axhline(g - 0.5, color=theme.faint, linewidth=0.8)
-        if bar is not None:
-            axes.axvline(bar, color=theme.ink, linewidth=0.9, linestyle=(0, (4, 4)), alpha=0.6)
         axes.set_yticks(range(len(groups)), groups)
         axes.set_ylim(len(groups) - 0.5, -0.5)
         if limits is not None:

@@ -25,26 +25,17 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Results:
-    """A whole `results.json`.
+    """A whole `results.json`."""
 
-    Attributes:
-        study: its name, as `controllability`.
-        checkpoint: the weights.
-        versions: package name -> version; also the hashes of other weights.
-        seeds: every seed used, in groups: name -> seeds.
-        quick: whether this was only the short first look.
-        seconds: how long it took. The only field that differs when a study is repeated with the same seed.
-        rows: the figures.
-        headline: the few figures that a reader wants first, name -> number.
-    """
-
-    study: str
-    checkpoint: Checkpoint
-    versions: Mapping[str, str]
-    seeds: Mapping[str, Sequence[int]]
-    quick: bool
+    study: str  # its name, as `controllability`
+    checkpoint: Checkpoint  # the weights
+    versions: Mapping[str, str]  # package name -> version; also the hashes of other weights
+    seeds: Mapping[str, Sequence[int]]  # every seed used, in groups: name -> seeds
+    quick: bool  # whether this was only the short first look
+    # how long it took. The only field that differs when a study is repeated with the same seed.
     seconds: float
-    rows: Sequence[Row]
+    rows: Sequence[Row]  # the figures
+    # the few figures that a reader wants first, name -> number
     headline: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

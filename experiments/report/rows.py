@@ -19,28 +19,18 @@ Key = tuple[str, str, str, str]
 class Row:
     """One figure with its 95 % interval.
 
-    Attributes:
-        method: who was measured, as `ours` or `copy frame`.
-        split: the scenes, as `controllability` or `unseen_colors`.
-        variant: which part of them, as `variant 1` or `9 frames`.
-        metric: what was measured, as `predicted_success`.
-        value: the figure.
-        low: the lower end of its interval.
-        high: the upper end.
-        n: the number of independent scenes behind it.
-
     Raises:
         ValueError: if a name is empty, a number is not finite, or the figure lies outside its interval.
     """
 
-    method: str
-    split: str
-    variant: str
-    metric: str
-    value: float
-    low: float
-    high: float
-    n: int
+    method: str  # who was measured, as `ours` or `copy frame`
+    split: str  # the scenes, as `controllability` or `unseen_colors`
+    variant: str  # which part of them, as `variant 1` or `9 frames`
+    metric: str  # what was measured, as `predicted_success`
+    value: float  # the figure
+    low: float  # the lower end of its interval
+    high: float  # the upper end
+    n: int  # the number of independent scenes behind it
 
     def __post_init__(self) -> None:
         for name in ("method", "split", "variant", "metric"):

@@ -22,17 +22,11 @@ TERMINAL = 80  # columns of a terminal that does not say how wide it is
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure.
+    """One figure."""
 
-    Attributes:
-        text: the figure.
-        interval: of 95 %, empty when there is none.
-        n: how many scenes it is from; None where nothing was measured.
-    """
-
-    text: str
-    interval: str = ""
-    n: int | None = None
+    text: str  # the figure
+    interval: str = ""  # of 95 %, empty when there is none
+    n: int | None = None  # how many scenes it is from; None where nothing was measured
 
     @classmethod
     def of(cls, row: Row | None, digits: int = 2, percent: bool = False) -> Cell:
@@ -187,42 +181,26 @@ class Table:
 
 @dataclass(frozen=True)
 class Paper:
-    """A line that the paper has.
+    """A line that the paper has."""
 
-    Attributes:
-        label: of the line.
-        figures: (split, variant, metric) -> the paper's figure.
-        note: where it was measured.
-    """
-
-    label: str
-    figures: Mapping[tuple[str, str, str], float]
-    note: str = "CLIPort at 336x336, another camera"
+    label: str  # of the line
+    figures: Mapping[tuple[str, str, str], float]  # (split, variant, metric) -> the paper's figure
+    note: str = "CLIPort at 336x336, another camera"  # where it was measured
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """What a line of a table shows.
+    """What a line of a table shows."""
 
-    Attributes:
-        key: `method` of the rows that it shows.
-        kind: `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures.
-        note: how it was measured, in a few words.
-        hue: colour in every plot, an index into the themes' series.
-        label: its name; the key if empty.
-        metric: shows this metric instead of the columns' own.
-        digits: with so many digits instead of the columns' own.
-        paper: the paper's figures of the same, for a line below it.
-    """
-
-    key: str
+    key: str  # `method` of the rows that it shows
+    # `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures
     kind: Kind = "ours"
-    note: str = ""
-    hue: int = 0
-    label: str = ""
-    metric: str = ""
-    digits: int | None = None
-    paper: Paper | None = None
+    note: str = ""  # how it was measured, in a few words
+    hue: int = 0  # colour in every plot, an index into the themes' series
+    label: str = ""  # its name; the key if empty
+    metric: str = ""  # shows this metric instead of the columns' own
+    digits: int | None = None  # with so many digits instead of the columns' own
+    paper: Paper | None = None  # the paper's figures of the same, for a line below it
 
     @property
     def name(self) -> str:
@@ -232,23 +210,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Column:
-    """What a column of a table shows: rows of one split, variant and metric.
+    """What a column of a table shows: rows of one split, variant and metric."""
 
-    Attributes:
-        title: at its head.
-        split: see `Row`.
-        variant: see `Row`.
-        metric: see `Row`.
-        digits: after the point.
-        percent: shown as `6.4 %`.
-    """
-
-    title: str
-    split: str
-    variant: str
-    metric: str
-    digits: int = 2
-    percent: bool = False
+    title: str  # at its head
+    split: str  # see `Row`
+    variant: str  # see `Row`
+    metric: str  # see `Row`
+    digits: int = 2  # after the point
+    percent: bool = False  # shown as `6.4 %`
+    paper: str = ""  # metric of the paper's figures, where that is another
 
 
 def columns(metric: str, places: Mapping[str, tuple[str, str]], digits: int = 2) -> tuple[Column, ...]:
@@ -258,19 +228,12 @@ def columns(metric: str, places: Mapping[str, tuple[str, str]], digits: int = 2)
 
 @dataclass(frozen=True)
 class TableSpec:
-    """A table that is filled from rows.
+    """A table that is filled from rows."""
 
-    Attributes:
-        title: of the table.
-        columns: from left to right.
-        lines: from top to bottom.
-        caption: a sentence below.
-    """
-
-    title: str
-    columns: Sequence[Column]
-    lines: Sequence[Line]
-    caption: str = ""
+    title: str  # of the table
+    columns: Sequence[Column]  # from left to right
+    lines: Sequence[Line]  # from top to bottom
+    caption: str = ""  # a sentence below
 
     def table(self, rows: Iterable[Row], missing: Iterable[str] = ()) -> Table:
         """The table, with a dash for what was not measured (yet).
@@ -321,7 +284,8 @@ class TableSpec:
 
     @staticmethod
     def _quoted(paper: Paper, line: Line, column: Column) -> float | None:
-        return paper.figures.get((column.split, column.variant, line.metric or column.metric))
+        metric = column.paper or line.metric or column.metric
+        return paper.figures.get((column.split, column.variant, metric))
 
 
 def _key(line: Line, column: Column) -> tuple[str, str, str, str]:

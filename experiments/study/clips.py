@@ -22,31 +22,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PredictionClip:
-    """A unit of work: one scene, real and imagined by ours and other models; pictures above masks.
+    """A unit of work: one scene, real and imagined by ours and other models; pictures above masks."""
 
-    Attributes:
-        scene: which.
-        models: the others.
-        seed: of the slots.
-        group: first part of the file's name.
-        rank: its place among the best or the worst.
-        best: among which of the two.
-        caption: what it was ranked by.
-        good: whether that is good in itself; None where only the rank is known.
-        variant: which of the scene's instructions.
-        variants: how many it has beside its own.
-    """
-
-    scene: StudyScene
-    models: tuple[Model, ...]
-    seed: int
-    group: str
-    rank: int
-    best: bool
-    caption: str
-    good: bool | None = None
-    variant: int = 0
-    variants: int = 0
+    scene: StudyScene  # which
+    models: tuple[Model, ...]  # the others
+    seed: int  # of the slots
+    group: str  # first part of the file's name
+    rank: int  # its place among the best or the worst
+    best: bool  # among which of the two
+    caption: str  # what it was ranked by
+    good: bool | None = None  # whether that is good in itself; None where only the rank is known
+    variant: int = 0  # which of the scene's instructions
+    variants: int = 0  # how many it has beside its own
 
     def run(self, worker: Worker) -> Clip:
         """Imagine and play it once more."""
@@ -83,17 +70,11 @@ class PredictionClip:
 
 @dataclass(frozen=True)
 class EpisodeClip:
-    """A unit of work: one episode of the closed loop, each plan as imagined beside what the camera saw.
+    """A unit of work: one episode of the closed loop, each plan as imagined beside what the camera saw."""
 
-    Attributes:
-        outcome: of the episode.
-        column: of the table, for the caption.
-        rank: for the file's name.
-    """
-
-    outcome: LoopOutcome
-    column: str
-    rank: int
+    outcome: LoopOutcome  # of the episode
+    column: str  # of the table, for the caption
+    rank: int  # for the file's name
 
     def run(self, worker: Worker) -> Clip:
         """Play it once more."""

@@ -14,49 +14,30 @@ from planning import EpisodeResult, Goal, run_episode
 
 @dataclass(frozen=True)
 class LoopOutcome:
-    """What came of one episode.
+    """What came of one episode."""
 
-    Attributes:
-        episode: which one.
-        text: the goal.
-        success: the simulator's verdict.
-        believes_reached: the planner's own verdict; None for the expert.
-        steps: pick-and-places carried out.
-        ranked_first: whether the candidate that scored best is the one that the goal names; None for goals of
-            several steps and for methods that do not rank.
-        planning_seconds: mean time of a plan; None without one.
-        error: why the loop gave up, or None.
-    """
-
-    episode: LoopEpisode
-    text: str
-    success: bool
-    believes_reached: bool | None
-    steps: int
+    episode: LoopEpisode  # which one
+    text: str  # the goal
+    success: bool  # the simulator's verdict
+    believes_reached: bool | None  # the planner's own verdict; None for the expert
+    steps: int  # pick-and-places carried out
+    # whether the candidate that scored best is the one that the goal names; None for goals of several steps
+    # and for methods that do not rank
     ranked_first: bool | None
-    planning_seconds: float | None
-    error: str | None
+    planning_seconds: float | None  # mean time of a plan; None without one
+    error: str | None  # why the loop gave up, or None
 
 
 @dataclass(frozen=True)
 class LoopEpisode:
-    """A unit of work: one method, one scene, one goal.
+    """A unit of work: one method, one scene, one goal."""
 
-    Attributes:
-        method: key of who acts.
-        scene: where.
-        variant: 0 for the scene's own instruction, i for its i-th variant with another target bowl.
-        variants: how many variants there are.
-        seed: of the slots and of chance.
-        load: makes the world model that is planned with; by default the study's own.
-    """
-
-    method: str
-    scene: StudyScene
-    variant: int = 0
-    variants: int = 0
-    seed: int = 0
-    load: LoadModel | None = None
+    method: str  # key of who acts
+    scene: StudyScene  # where
+    variant: int = 0  # 0 for the scene's own instruction, i for its i-th variant with another target bowl
+    variants: int = 0  # how many variants there are
+    seed: int = 0  # of the slots and of chance
+    load: LoadModel | None = None  # makes the world model that is planned with; by default the study's own
 
     def run(self, worker: Worker) -> LoopOutcome:
         """Play the episode."""

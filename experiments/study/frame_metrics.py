@@ -44,19 +44,12 @@ def video_features(name: str) -> VJepaFeatures:
 
 @dataclass(frozen=True)
 class Measures:
-    """What is measured beside PSNR and SSIM.
+    """What is measured beside PSNR and SSIM."""
 
-    Attributes:
-        perceptual: which of `PERCEPTUAL`.
-        jedi: the V-JEPA of JEDi, or None.
-        jedi_lengths: how many frames are a video for it.
-        reasons: metric -> why it is absent.
-    """
-
-    perceptual: tuple[str, ...] = ()
-    jedi: str | None = None
-    jedi_lengths: tuple[int, ...] = ()
-    reasons: tuple[tuple[str, str], ...] = ()
+    perceptual: tuple[str, ...] = ()  # which of `PERCEPTUAL`
+    jedi: str | None = None  # the V-JEPA of JEDi, or None
+    jedi_lengths: tuple[int, ...] = ()  # how many frames are a video for it
+    reasons: tuple[tuple[str, str], ...] = ()  # metric -> why it is absent
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -102,18 +95,13 @@ def available_measures(
 
 @dataclass(frozen=True, eq=False)
 class FrameScores:
-    """One prediction, measured.
+    """One prediction, measured."""
 
-    Attributes:
-        method: whose.
-        curves: metric -> (t,), one value for each frame after the first; the metrics of `Measures.metrics`, and the
-            same with the ending `UPPER` without the bottom rows, where they were asked for.
-        features: length -> (D,) for JEDi.
-    """
-
-    method: str
+    method: str  # whose
+    # metric -> (t,), one value for each frame after the first; the metrics of `Measures.metrics`, and the
+    # same with the ending `UPPER` without the bottom rows, where they were asked for
     curves: Mapping[str, np.ndarray]
-    features: Mapping[int, np.ndarray]
+    features: Mapping[int, np.ndarray]  # length -> (D,) for JEDi
 
     def mean(self, metric: str, length: int) -> float | None:
         """Mean over the first `length` frames after the observed one; None for a prediction that is shorter."""

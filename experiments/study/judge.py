@@ -26,14 +26,10 @@ from textocvp import Rollout
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """One method on one scene, for its V instructions (original first) and S slot seeds.
+    """One method on one scene, for its V instructions (original first) and S slot seeds."""
 
-    Attributes:
-        success_SV: bool.
-        miss_SV: distance in pixels between block and bowl over the last frames; inf where one is not seen.
-    """
-
-    success_SV: np.ndarray
+    success_SV: np.ndarray  # bool
+    # distance in pixels between block and bowl over the last frames; inf where one is not seen
     miss_SV: np.ndarray
 
 

@@ -15,28 +15,21 @@ ARM = 1  # its label in a segmentation
 
 @dataclass(frozen=True, eq=False)
 class MaskScores:
-    """How well the masks of T frames fit. All (T,), frame 0 is the observed one; nan where nothing of it is seen.
+    """How well the masks of T frames fit. All (T,), frame 0 is the observed one; nan where nothing of it is seen."""
 
-    Attributes:
-        iou: mean over the blocks and bowls that are seen; slots are matched to them afresh in every frame (Hungarian),
-            as in the paper.
-        moving: mean of the named block and the arm, the only things that move; matched as above, with the arm.
-        block, arm: these two by themselves.
-        still: as `iou`, without the named block.
-        kept: mean over blocks and bowls, each held against the one slot that was matched to it in frame 0: a model
-            that lets two slots swap their objects loses here and nowhere else.
-        kept_moving: the same for the named block and the arm.
-        ari: adjusted Rand index over the foreground, arm included.
-    """
-
+    # mean over the blocks and bowls that are seen; slots are matched to them afresh in every frame
+    # (Hungarian), as in the paper
     iou: np.ndarray
+    # mean of the named block and the arm, the only things that move; matched as above, with the arm
     moving: np.ndarray
-    block: np.ndarray
+    block: np.ndarray  # these two by themselves
     arm: np.ndarray
-    still: np.ndarray
+    still: np.ndarray  # as `iou`, without the named block
+    # mean over blocks and bowls, each held against the one slot that was matched to it in frame 0: a model
+    # that lets two slots swap their objects loses here and nowhere else
     kept: np.ndarray
-    kept_moving: np.ndarray
-    ari: np.ndarray
+    kept_moving: np.ndarray  # the same for the named block and the arm
+    ari: np.ndarray  # adjusted Rand index over the foreground, arm included
 
 
 def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> MaskScores:

@@ -23,23 +23,15 @@ MakePlanner = Callable[[Imagines, Goal, np.random.Generator, int], Planner]
 
 @dataclass(frozen=True, kw_only=True)
 class Method(Line):
-    """A method. The fields of `Line` say how it is shown; these say what it is.
+    """A method. The fields of `Line` say how it is shown; these say what it is."""
 
-    Attributes:
-        model: bundled checkpoint of a model beside the study's own; empty for none.
-        slots: whether that model has slots; if not, masks are read off its frames by our parser.
-        train: what to type to train it.
-        plan: makes the planner with which it acts in the closed loop; None for one that does not.
-        privileged: whether its planner is told by the simulator's segmentation which slot is what.
-        expert: whether it is the scripted expert.
-    """
-
-    model: str = ""
-    slots: bool = True
-    train: str = ""
+    model: str = ""  # bundled checkpoint of a model beside the study's own; empty for none
+    slots: bool = True  # whether that model has slots; if not, masks are read off its frames by our parser
+    train: str = ""  # what to type to train it
+    # makes the planner with which it acts in the closed loop; None for one that does not
     plan: MakePlanner | None = None
-    privileged: bool = False
-    expert: bool = False
+    privileged: bool = False  # whether its planner is told by the simulator's segmentation which slot is what
+    expert: bool = False  # whether it is the scripted expert
 
     @property
     def acts(self) -> bool:
@@ -226,23 +218,14 @@ def lines(keys: Iterable[str], notes: Mapping[str, str] | None = None) -> tuple[
 
 @dataclass(frozen=True)
 class Model:
-    """The model of a method, which is there.
+    """The model of a method, which is there."""
 
-    Attributes:
-        key: of the method.
-        load: makes it.
-        slots: see `Method`.
-        checkpoint: where it came from.
-        sha256: of its weights.
-        longest: how many frames it can imagine at once; None for any number.
-    """
-
-    key: str
-    load: LoadModel
-    slots: bool
-    checkpoint: str
-    sha256: str
-    longest: int | None
+    key: str  # of the method
+    load: LoadModel  # makes it
+    slots: bool  # see `Method`
+    checkpoint: str  # where it came from
+    sha256: str  # of its weights
+    longest: int | None  # how many frames it can imagine at once; None for any number
 
 
 @dataclass(frozen=True)

@@ -53,13 +53,9 @@ class LoadCheckpoint:
 
 @dataclass
 class Worker:
-    """What a unit of work may use, made once a process.
+    """What a unit of work may use, made once a process."""
 
-    Attributes:
-        world_model: the study's own.
-    """
-
-    world_model: StudyModel
+    world_model: StudyModel  # the study's own
     _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
     _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
 
@@ -87,15 +83,10 @@ class Unit(Protocol[Out]):
 
 @dataclass(frozen=True)
 class Pool:
-    """Runs units on `processes` processes with one thread each, so that rounding is the same for any number.
+    """Runs units on `processes` processes with one thread each, so that rounding is the same for any number."""
 
-    Attributes:
-        load: makes the world model, once in each process.
-        processes: at least 1; with 1 everything runs in this process.
-    """
-
-    load: LoadModel
-    processes: int
+    load: LoadModel  # makes the world model, once in each process
+    processes: int  # at least 1; with 1 everything runs in this process
 
     def run(self, units: Sequence[Unit[Out]]) -> Iterator[Out]:
         """The results, in the order of the units, as they become ready."""

@@ -18,21 +18,13 @@ from textocvp import Rollout, WorldModel
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """A scene and what the expert did in it.
+    """A scene and what the expert did in it."""
 
-    Attributes:
-        sampled: the scene.
-        text: the instruction that the expert carried out.
-        wrong_text: another one.
-        frames_THW3: uint8, the first observation included.
-        segmentations_THW: see `ExpertEpisode`.
-    """
-
-    sampled: SampledScene
-    text: str
-    wrong_text: str
-    frames_THW3: np.ndarray
-    segmentations_THW: np.ndarray
+    sampled: SampledScene  # the scene
+    text: str  # the instruction that the expert carried out
+    wrong_text: str  # another one
+    frames_THW3: np.ndarray  # uint8, the first observation included
+    segmentations_THW: np.ndarray  # see `ExpertEpisode`
 
     @property
     def frames_T3HW(self) -> Tensor:
@@ -42,17 +34,12 @@ class GroundTruth:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a method makes of a scene.
+    """What a method makes of a scene."""
 
-    Attributes:
-        method: its key.
-        frames_T3HW: in 0..1, the redrawn first one included. Fewer than asked for where a model cannot look as far.
-        rollout: its slots, where it has any (B = 1).
-    """
-
-    method: str
+    method: str  # its key
+    # in 0..1, the redrawn first one included. Fewer than asked for where a model cannot look as far.
     frames_T3HW: Tensor
-    rollout: Rollout | None = None
+    rollout: Rollout | None = None  # its slots, where it has any (B = 1)
 
 
 def predict(

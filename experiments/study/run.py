@@ -17,7 +17,7 @@ from typing import Any
 
 import tyro
 
-from experiments.report.page import Card, CardSpec, Report, Section
+from experiments.report.page import AGAIN, Card, CardSpec, Report, Section
 from experiments.report.progress import StudyProgress
 from experiments.report.results import Checkpoint, Results, package_versions
 from experiments.report.rows import Key, Row, pick_figures
@@ -122,17 +122,13 @@ class ScenesArgs(StudyArgs):
 
 @dataclass(frozen=True)
 class Part:
-    """A kind of work.
+    """A kind of work."""
 
-    Attributes:
-        units: of work; for a part that follows from the results of others, nothing, and `cases` makes them later.
-        seconds: of a unit on one core, roughly; they make the first estimate of the time that is left.
-        count: units that are expected of a part that follows from others.
-    """
-
+    # of work; for a part that follows from the results of others, nothing, and `cases` makes them later
     units: Sequence[Unit[Any]] = ()
+    # of a unit on one core, roughly; they make the first estimate of the time that is left
     seconds: float = 1.0
-    count: int = 0
+    count: int = 0  # units that are expected of a part that follows from others
 
 
 Found = Mapping[str, list[Any]]
@@ -141,61 +137,43 @@ Found = Mapping[str, list[Any]]
 
 @dataclass(frozen=True)
 class Study:
-    """A study: `experiments/NAME.py`.
+    """A study: `experiments/NAME.py`."""
 
-    Attributes:
-        name: of its file and of its folder of results.
-        title: for reports.
-        question: for reports, in a sentence.
-        units: the work that is known beforehand: part -> `Part`.
-        rows: the figures, of whatever is finished; must bear parts with no result yet.
-        tables: for the terminal, the live view and the summary. Columns and lines without figures show a dash.
-        page: sections of the report, of the results and of what the units found.
-        sizes: how much is measured; tests give their own.
-        args: class of its command line.
-        methods: keys of `METHODS` that are measured; those with a `model` are loaded.
-        cases: more work, that follows from what was found; may name only parts that `units` announced.
-        cards: the first figures of the report.
-        headline: name -> key of the row. A mapping is a promise, and what of it was not measured is an error; a
-            function of the run may name more than can be measured.
-        first: names of the headline that the index shows first.
-        measures: what of frames is measured.
-        horizon: how many frames the model must be able to imagine at once.
-        inputs: files whose content changes figures, beside the checkpoints of `methods`.
-        versions: more entries of `versions` in results.json.
-        files: more files of the folder: name -> text.
-        printed: more tables, that are printed after the others.
-        prepare: makes what the study needs once, `Run.prepared`; raises UsageError if the model does not do.
-        one_process: whether everything runs in this process, as for timing.
-        again: how far the figures come out the same.
-    """
-
-    name: str
-    title: str
-    question: str
-    units: Callable[[Run], Mapping[str, Part]]
+    name: str  # of its file and of its folder of results
+    title: str  # for reports
+    question: str  # for reports, in a sentence
+    units: Callable[[Run], Mapping[str, Part]]  # the work that is known beforehand: part -> `Part`
+    # the figures, of whatever is finished; must bear parts with no result yet
     rows: Callable[[Run, Found], Sequence[Row]]
+    # for the terminal, the live view and the summary. Columns and lines without figures show a dash.
     tables: Sequence[TableSpec]
+    # sections of the report, of the results and of what the units found
     page: Callable[[Run, Results, Found], Sequence[Section]]
-    sizes: Callable[[Any], Any]
-    args: type[StudyArgs] = StudyArgs
-    methods: Sequence[str] = ()
+    sizes: Callable[[Any], Any]  # how much is measured; tests give their own
+    args: type[StudyArgs] = StudyArgs  # class of its command line
+    methods: Sequence[str] = ()  # keys of `METHODS` that are measured; those with a `model` are loaded
+    # more work, that follows from what was found; may name only parts that `units` announced
     cases: Callable[[Run, Found], Mapping[str, Sequence[Unit[Any]]]] | None = None
+    # the first figures of the report
     cards: Sequence[CardSpec] | Callable[[Run, Results], Sequence[CardSpec | Card]] = ()
+    # name -> key of the row. A mapping is a promise, and what of it was not measured is an error; a function
+    # of the run may name more than can be measured.
     headline: Mapping[str, Key] | Callable[[Run], Mapping[str, Key]] = field(default_factory=dict)
-    first: Sequence[str] = ()
-    measures: Callable[[Any], Measures] = lambda args: Measures()
-    horizon: int = 1
+    first: Sequence[str] = ()  # names of the headline that the index shows first
+    measures: Callable[[Any], Measures] = lambda args: Measures()  # what of frames is measured
+    horizon: int = 1  # how many frames the model must be able to imagine at once
+    # files whose content changes figures, beside the checkpoints of `methods`
     inputs: Callable[[Any], Sequence[Path]] = lambda args: ()
+    # more entries of `versions` in results.json
     versions: Callable[[Run], Mapping[str, str]] = lambda run: {}
+    # more files of the folder: name -> text
     files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}
+    # more tables, that are printed after the others
     printed: Callable[[Run, Results], Sequence[Table]] = lambda run, results: ()
+    # makes what the study needs once, `Run.prepared`; raises UsageError if the model does not do
     prepare: Callable[[Run], Any] = lambda run: None
-    one_process: bool = False
-    again: str = (
-        "The seed fixes scenes, instructions and slots: "
-        "everything in results.json but the seconds comes out the same."
-    )
+    one_process: bool = False  # whether everything runs in this process, as for timing
+    again: str = AGAIN  # how far the figures come out the same
 
 
 class Run:
@@ -232,7 +210,7 @@ class Run:
         loads: Mapping[str, LoadModel] | None = None,
         measures: Measures | None = None,
     ) -> None:
-        self.study, self.args, self.began = study, args, time.monotonic()
+        self.study, self.args = study, args
         self.folder = OutputFolder(args.folder(study.name))
         self.sizes = study.sizes(args) if sizes is None else sizes
         self.load = load or LoadCheckpoint(args.checkpoint)

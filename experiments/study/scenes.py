@@ -20,19 +20,13 @@ SCENES_PER_SEED = 10_000
 
 @dataclass(frozen=True)
 class StudyScene:
-    """One scene of a split.
+    """One scene of a split."""
 
-    Attributes:
-        split: its name, one of the environments' splits or of `LONG_GOALS`.
-        seed: of the environment.
-        options: for `reset`; sorted items, so that a scene can be compared and hashed.
-        steps: pairs of the goal.
-    """
-
-    split: str
-    seed: int
+    split: str  # its name, one of the environments' splits or of `LONG_GOALS`
+    seed: int  # of the environment
+    # for `reset`; sorted items, so that a scene can be compared and hashed
     options: tuple[tuple[str, Any], ...]
-    steps: int = 1
+    steps: int = 1  # pairs of the goal
 
     def make(self) -> gym.Env[Any, Any]:
         """The environment it is played in, which records the frames of its motions."""
@@ -64,19 +58,12 @@ def study_scenes(split: str, count: int, seed: int) -> list[StudyScene]:
 
 @dataclass(frozen=True, eq=False)
 class SampledScene:
-    """A scene as the environment sampled it.
+    """A scene as the environment sampled it."""
 
-    Attributes:
-        scene: which.
-        observation: of its reset.
-        info: of its reset.
-        texts: its own instruction, then the variants.
-    """
-
-    scene: StudyScene
-    observation: Mapping[str, Any]
-    info: Mapping[str, Any]
-    texts: tuple[str, ...]
+    scene: StudyScene  # which
+    observation: Mapping[str, Any]  # of its reset
+    info: Mapping[str, Any]  # of its reset
+    texts: tuple[str, ...]  # its own instruction, then the variants
 
     def options(self, variant: int) -> dict[str, Any]:
         """`reset` options that, with the scene's seed, build it again with its `variant`-th text."""
@@ -139,19 +126,12 @@ def wrong_text(sampled: SampledScene) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ExpertEpisode:
-    """What the scripted expert did.
+    """What the scripted expert did."""
 
-    Attributes:
-        frames: (T, H, W, 3) uint8, from the first observation on.
-        segmentations: (T, H, W): 0 background, 1 arm, 2 + i object i.
-        success: the simulator's verdict.
-        steps: pick-and-places.
-    """
-
-    frames: np.ndarray
-    segmentations: np.ndarray
-    success: bool
-    steps: int
+    frames: np.ndarray  # (T, H, W, 3) uint8, from the first observation on
+    segmentations: np.ndarray  # (T, H, W): 0 background, 1 arm, 2 + i object i
+    success: bool  # the simulator's verdict
+    steps: int  # pick-and-places
 
 
 def play_expert(env: gym.Env[Any, Any], sampled: SampledScene, variant: int = 0) -> ExpertEpisode:
