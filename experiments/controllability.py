@@ -14,251 +14,503 @@ best, its motion is carried out in PyBullet, and the simulator alone judges. Wri
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import torch
 
-from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.closed_loop import LoopEpisode, LoopOutcome, Method
-from experiments.protocol.controllability_report import build_report, loop_table, predicted_table
-from experiments.protocol.figures import mean_row, rate_row
-from experiments.protocol.gallery import Picture, choose_loop, choose_predicted
-from experiments.protocol.predicted import HORIZON, PredictedOutcome, PredictedScene
-from experiments.protocol.running import StudyRun
-from experiments.protocol.scenes import LONG_GOALS, LOOP_COLUMNS, LoopColumn, test_scenes
-from experiments.protocol.workers import LoadWorldModel, Unit
-from experiments.reporting import Results, Row, StudyProgress
+from experiments.report.page import CardSpec, Clips, Figure, Section
+from experiments.report.plots import curve_plot, heat_map, plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Row, mean_row, rate_row
+from experiments.report.tables import Column, Line, TableSpec, columns
+from experiments.study.clips import PredictionClip, episode_clips
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome
+from experiments.study.judge import Verdicts, find_things, first_frame, judge, stack, trace
+from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
+from experiments.study.pool import Unit, Worker
+from experiments.study.run import Found, FullArgs, Part, Run, Study, start
+from experiments.study.scenes import LONG_GOALS, StudyScene, play_expert, sample_scene, study_scenes
+from planning import THRESHOLDS, GroundingError, Instruction, PinholeCamera, Trace, ground
+from textocvp import WorldModel
 
 VARIANTS = 3
-PREDICTED_METHODS = ("ours", "true frames", "wrong text", "copy frame")
-LOOP_METHODS: tuple[Method, ...] = ("ours", "ours, privileged", "expert", "random candidate")
+SPLIT = "controllability"
+PREDICTED = ("ours", "true frames", "wrong text", "copy frame")
+PREDICTED_PLACES = {name: (SPLIT, name) for name in ("original", "variant 1", "variant 2", "variant 3")}
+OTHER_SPLITS = {
+    "unseen_colors": "unseen colours", "more_objects": "8 objects",
+    "two_steps": "two steps", "three_steps": "three steps",
+}  # fmt: skip
+LOOP_PLACES = {**PREDICTED_PLACES, **{name: (split, name) for split, name in OTHER_SPLITS.items()}}
+"""Columns of the closed loop: title -> (split, variant)."""
+FARTHEST = 64  # pixels along a side of the frame
 
 
-@dataclass
-class Args(StudyArgs):
-    """Controllability study: predicted and in the closed loop."""
-
-    out: Path = Path("results/controllability")
-    """Folder for results.json, report.html, plots and clips."""
-    full: bool = False
-    """100 scenes x 4 instructions x 5 slot seeds, as the paper; takes about an hour."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.quick and self.full:
-            raise UsageError("--quick and --full exclude each other")
-
-    @property
-    def sizes(self) -> Sizes:
-        """How much is measured."""
-        return QUICK if self.quick else FULL if self.full else DEFAULT
+# --- how much is measured ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured, in scenes.
+    """How much is measured, in scenes."""
 
-    Attributes:
-        predicted: of the predicted study. slot_seeds: slot-sampling seeds of each of them.
-        loop: of each column of the closed loop with the controllability scenes, for ours and the expert.
-        other: of each other column with goals of one step. long: of each column with longer goals.
-        controls: at most this many in any column for privileged grounding and the random candidate.
-        clips: how many best and how many worst cases the report shows.
-    """
+    predicted: int  # of the predicted study
+    slot_seeds: int  # slot-sampling seeds of each of them
+    loop: int  # of each column of the closed loop with the controllability scenes, for ours and the expert
+    other: int  # of each other column with goals of one step
+    long: int  # of each column with longer goals
+    controls: int  # at most this many in any column for every other method
+    clips: int  # how many best and how many worst cases the report shows
 
-    predicted: int
-    slot_seeds: int
-    loop: int
-    other: int
-    long: int
-    controls: int
-    clips: int
-
-    def scenes(self, column: LoopColumn, method: Method) -> int:
-        """How many scenes a method plays in a column of the closed loop."""
-        steps = LONG_GOALS.get(column.split, 1)
-        most = self.long if steps > 1 else self.loop if column.split == "controllability" else self.other
+    def scenes(self, split: str, method: str) -> int:
+        """How many scenes of a split a method plays."""
+        long = split in LONG_GOALS
+        most = self.long if long else self.loop if split == SPLIT else self.other
         if method in ("ours", "expert"):
             return most
-        return min(most, self.controls if steps == 1 else (self.controls + 1) // 2)
+        return min(most, (self.controls + 1) // 2 if long else self.controls)
 
 
 QUICK = Sizes(predicted=12, slot_seeds=1, loop=8, other=4, long=1, controls=3, clips=3)
 DEFAULT = Sizes(predicted=100, slot_seeds=1, loop=60, other=30, long=10, controls=20, clips=3)
 FULL = Sizes(predicted=100, slot_seeds=5, loop=100, other=100, long=100, controls=100, clips=6)
-# Rough seconds of one unit on one core; they only weigh the parts in the progress bar.
-SECONDS = {"predicted study": 2.6, "closed loop": 0.8, "long goals": 5.0, "pictures": 1.5}
 
 
-def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = None) -> Results:
-    """Run the study and write its folder.
+# --- units of work ----------------------------------------------------------------------------------------------------
 
-    Args:
-        args: the command line.
-        load: makes the world model; by default loads `args.checkpoint`.
-        sizes: how much is measured; by default what `args` ask for.
 
-    Raises:
-        OSError: if the folder cannot be written, before any work is done.
-        CheckpointError: if there is no such checkpoint, before any work is done.
-    """
-    run, sizes = StudyRun.open("controllability", args, load, HORIZON), sizes or args.sizes
-    pool = run.pool
-    slot_seeds = tuple(range(args.seed, args.seed + sizes.slot_seeds))
-    scenes = test_scenes("controllability", sizes.predicted, args.seed)
-    predicted_units = [PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes]
-    episodes = loop_episodes(sizes, args.seed)
-    single = [episode for episode in episodes if episode.scene.steps == 1]
-    long = [episode for episode in episodes if episode.scene.steps > 1]
-    parts = {
-        "predicted study": len(predicted_units),
-        "closed loop": len(single),
-        "long goals": len(long),
-        "pictures": 4 * sizes.clips,
+@dataclass(frozen=True, eq=False)
+class PredictedOutcome:
+    """Everything that was judged in one scene."""
+
+    scene: StudyScene  # which
+    texts: tuple[str, ...]  # its V instructions, original first
+    # method -> its verdicts. `wrong text` is judged for another instruction than it was imagined with; `copy
+    # frame` is the first frame repeated; `true frames` is the parser on the expert's motion, S = 1.
+    verdicts: Mapping[str, Verdicts]
+    expert_V: np.ndarray  # whether the expert reached the goal, judged by the simulator
+    imagined_TV: np.ndarray  # block to bowl distance in pixels over time for the first slot seed
+    true_TV: np.ndarray  # the same of the true frames
+
+
+@dataclass(frozen=True)
+class PredictedScene:
+    """A unit of work: one scene, its original instruction and its variants, several slot-sampling seeds."""
+
+    scene: StudyScene
+    variants: int
+    slot_seeds: tuple[int, ...]
+
+    def run(self, worker: Worker) -> PredictedOutcome:
+        """Imagine, judge, and judge the controls."""
+        env = worker.environment(self.scene)
+        sampled = sample_scene(env, self.scene, self.variants)
+        texts, camera = list(sampled.texts), PinholeCamera.from_info(sampled.info["camera"])
+        instructions = [Instruction.parse(text) for text in texts]
+        # Rolling the list by one judges the rollout of each instruction for its neighbour in the list.
+        others = instructions[1:] + instructions[:1]
+        judged: dict[str, list] = {"ours": [], "wrong text": [], "copy frame": []}
+        first: Trace | None = None
+        for seed in self.slot_seeds:
+            rollout = worker.world_model.rollout(
+                sampled.observation["rgb"], texts, horizon=HORIZON, seed=seed
+            )
+            grounding = find_things(rollout, camera, instructions)
+            traced = trace(rollout, grounding, instructions)
+            judged["ours"].append(judge(traced))
+            judged["wrong text"].append(judge(trace(rollout, grounding, others)))
+            judged["copy frame"].append(judge(first_frame(traced)))
+            first = first or traced
+        true, expert = [], []
+        for variant, instruction in enumerate(instructions):
+            played = play_expert(env, sampled, variant)
+            expert.append(played.success)
+            parsed = worker.world_model.parse(played.frames, seed=self.slot_seeds[0])
+            true.append(trace(parsed, find_things(parsed, camera, [instruction]), [instruction]))
+        judged["true frames"] = [[torch.cat(column) for column in zip(*map(judge, true), strict=True)]]
+        assert first is not None
+        true_Bt = [one.block_bowl_Bt[0].numpy() for one in true]
+        return PredictedOutcome(
+            scene=self.scene,
+            texts=tuple(texts),
+            verdicts={method: stack(parts) for method, parts in judged.items()},
+            expert_V=np.array(expert),
+            imagined_TV=first.block_bowl_Bt.T.numpy(),
+            true_TV=np.stack(_same_length(true_Bt), axis=1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class AttentionMap:
+    """What slots of one rollout attended to, (slots, words), mean over layers, heads and frames."""
+
+    slots: tuple[str, ...]
+    words: tuple[str, ...]
+    weights: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReadAttention:
+    """A unit of work: the attention of the named block and bowl, the arm and another bowl; None if not found."""
+
+    scene: StudyScene
+    variant: int
+    seed: int
+
+    def run(self, worker: Worker) -> AttentionMap | None:
+        """Imagine the scene once more."""
+        model = worker.world_model
+        if not isinstance(model, WorldModel):
+            return None
+        sampled = sample_scene(worker.environment(self.scene), self.scene, VARIANTS)
+        text = sampled.texts[self.variant]
+        rollout = model.rollout(
+            sampled.observation["rgb"], [text], horizon=HORIZON, seed=self.seed, attention=True
+        )
+        if rollout.attention is None:
+            return None
+        instruction, words = Instruction.parse(text), tuple(model.model.text.words(text))
+        named = [instruction.block_thing, instruction.bowl_thing]
+        try:
+            grounding = ground(rollout, PinholeCamera.from_info(sampled.info["camera"]))[0].told(named)
+            slots = {f"{thing.color} {thing.kind} (named)": grounding.find(thing) for thing in named}
+            slots["arm"] = grounding.arm
+        except GroundingError:
+            return None
+        other = next((t for t in grounding.things if t not in named and t.kind == "bowl"), None)
+        if other is not None:
+            slots[f"{other.color} bowl"] = grounding.things[other]
+        weights_KL = rollout.attention[0].mean(dim=(0, 1, 2))[:, : len(words)]
+        weights = np.stack([weights_KL[list(its)].mean(0).numpy() for its in slots.values()])
+        return AttentionMap(tuple(slots), words, weights)
+
+
+def units(run: Run) -> dict[str, Part]:
+    """The scenes of the predicted study; every episode of the closed loop, column by column."""
+    sizes, seed = run.sizes, run.args.seed
+    slot_seeds = tuple(range(seed, seed + sizes.slot_seeds))
+    scenes = study_scenes(SPLIT, sizes.predicted, seed)
+    single: list[LoopEpisode] = []
+    long: list[LoopEpisode] = []
+    for title, (split, _) in LOOP_PLACES.items():
+        variant = list(LOOP_PLACES).index(title) if split == SPLIT else 0
+        for i, scene in enumerate(study_scenes(split, sizes.scenes(split, "ours"), seed)):
+            for method in PLANNERS:
+                if i < sizes.scenes(split, method):
+                    variants = VARIANTS if split == SPLIT else 0
+                    episode = LoopEpisode(method, scene, variant, variants, seed)
+                    (single if scene.steps == 1 else long).append(episode)
+    return {
+        "predicted study": Part([PredictedScene(scene, VARIANTS, slot_seeds) for scene in scenes], 0.8),
+        "closed loop": Part(single, 0.25),
+        "long goals": Part(long, 0.9),
+        "pictures": Part(seconds=0.5, count=4 * sizes.clips),
+        "attention": Part(seconds=0.3, count=1),
     }
-    rows: list[Row] = []
-    predicted: list[PredictedOutcome] = []
-    loop: list[LoopOutcome] = []
-    with StudyProgress({part: (n, SECONDS[part]) for part, n in parts.items()}) as progress:
-        for outcome in progress.track("predicted study", pool.run(predicted_units)):
-            predicted.append(outcome)
-            rows = predicted_rows(predicted)
-            progress.show(predicted_table(rows))
-        for part, some in (("closed loop", single), ("long goals", long)):
-            for episode in progress.track(part, pool.run(some)):
-                loop.append(episode)
-                if len(loop) % 5 == 0:
-                    progress.show(predicted_table(rows), loop_table(loop_rows(loop)))
-        rows += loop_rows(loop)
-        columns = {(column.split, column.variant): column.name for column in LOOP_COLUMNS}
-        imagined = choose_predicted(predicted, VARIANTS, slot_seeds[0], sizes.clips)
-        acted = choose_loop(loop, columns, sizes.clips)
-        progress.expect("pictures", len(imagined) + len(acted))
-        units: list[Unit[Picture]] = [*imagined, *acted]
-        pictures = list(progress.track("pictures", pool.run(units)))
-    results = run.results(rows, headline(rows), seeds_used(slot_seeds, predicted_units, episodes))
-    shown = pictures[: len(imagined)], pictures[len(imagined) :]
-    report = build_report(results, predicted, timings(loop), *shown, run.command)
-    # Times are not in results.json, which must come out the same when a study is repeated.
-    run.write(report, {"timings.json": json.dumps(timings(loop), indent=2) + "\n"})
-    run.close(progress, results, [predicted_table(rows), loop_table(rows)])
-    return results
 
 
-def loop_episodes(sizes: Sizes, seed: int) -> list[LoopEpisode]:
-    """Every episode of the closed loop, column by column."""
-    episodes = []
-    for column in LOOP_COLUMNS:
-        variants = VARIANTS if column.split == "controllability" else 0
-        for i, scene in enumerate(test_scenes(column.split, sizes.scenes(column, "ours"), seed)):
-            for method in LOOP_METHODS:
-                if i < sizes.scenes(column, method):
-                    episodes.append(LoopEpisode(method, scene, column.variant, variants, seed))
-    return episodes
+def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
+    """Pictures of the best and worst predicted cases and of the closed loop; attention of the best case."""
+    count, seed = run.sizes.clips, run.args.seed
+    predicted = predicted_clips(found["predicted study"], seed, count)
+    best = [ReadAttention(clip.scene, clip.variant, seed) for clip in predicted[:1]]
+    return {"pictures": [*predicted, *episode_clips(_loop(found), column_of, count)], "attention": best}
+
+
+def predicted_clips(outcomes: Sequence[PredictedOutcome], seed: int, count: int) -> list[PredictionClip]:
+    """The `count` best and `count` worst cases of the first slot seed, each of another scene."""
+    found = []
+    for outcome in outcomes:
+        ours = outcome.verdicts["ours"]
+        found += [
+            (bool(ours.success_SV[0, v]), float(ours.miss_SV[0, v]), outcome.scene, v)
+            for v in range(len(outcome.texts))
+        ]
+    clips = []
+    for best in (True, False):
+        firsts: dict[int, tuple[bool, float, StudyScene, int]] = {}
+        for case in sorted(found, key=lambda c: (not c[0], c[1]) if best else (c[0], -c[1])):
+            firsts.setdefault(case[2].seed, case)
+        for rank, (success, miss, scene, v) in enumerate(list(firsts.values())[:count], start=1):
+            ends = f"block ends {miss:.1f} px from the bowl's centre" if np.isfinite(miss) else "not found"
+            caption = f"{'original' if v == 0 else f'variant {v}'}; {ends}"
+            clips.append(
+                PredictionClip(scene, (), seed, "predicted", rank, best, caption, success, v, VARIANTS)
+            )
+    return clips
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def rows(run: Run, found: Found) -> list[Row]:
+    """Every figure, as far as there are outcomes."""
+    return [*predicted_rows(found["predicted study"]), *loop_rows(_loop(found))]
 
 
 def predicted_rows(outcomes: Sequence[PredictedOutcome]) -> list[Row]:
     """Success of each method: original, each variant, and the mean of the variants."""
-    rows = []
-    for method in PREDICTED_METHODS:
-        success_NSV = np.stack([outcome.verdicts(method).success_SV for outcome in outcomes])
-        for v in range(VARIANTS + 1):
-            name = "original" if v == 0 else f"variant {v}"
-            rows.append(rate_row(method, "controllability", name, "predicted_success", success_NSV[:, :, v]))
-        for name, part in (("variants mean", success_NSV[:, :, 1:]), ("all", success_NSV)):
-            rows.append(rate_row(method, "controllability", name, "predicted_success", part))
-    return rows
+    figures = []
+    for method in PREDICTED if outcomes else ():
+        success_NSV = np.stack([outcome.verdicts[method].success_SV for outcome in outcomes])
+        for v, name in enumerate(PREDICTED_PLACES):
+            figures.append(rate_row(method, SPLIT, name, "predicted_success", success_NSV[:, :, v]))
+        for name, some in (("variants mean", success_NSV[:, :, 1:]), ("all", success_NSV)):
+            figures.append(rate_row(method, SPLIT, name, "predicted_success", some))
+    return figures
 
 
 def loop_rows(outcomes: Sequence[LoopOutcome]) -> list[Row]:
-    """Success, steps and ranking of each method in each column, as far as there are outcomes."""
-    rows = []
-    for method in LOOP_METHODS:
+    """Success, steps and ranking of each method in each column."""
+    figures = []
+    for method in PLANNERS:
         mine = [outcome for outcome in outcomes if outcome.episode.method == method]
-        for column in LOOP_COLUMNS:
-            here = [
-                o
-                for o in mine
-                if (o.episode.scene.split, o.episode.variant) == (column.split, column.variant)
-            ]
+        for title, (split, variant) in LOOP_PLACES.items():
+            here = [o for o in mine if column_of(o.episode) == title]
             if not here:
                 continue
-            split, name = column.split, column.name
-            rows.append(rate_row(method, split, name, "closed_loop_success", [o.success for o in here]))
-            rows.append(mean_row(method, split, name, "steps", [o.steps for o in here]))
+            place = method, split, variant
+            figures.append(rate_row(*place, "closed_loop_success", [o.success for o in here]))
+            figures.append(mean_row(*place, "steps", [o.steps for o in here]))
             if all(o.ranked_first is not None for o in here):
-                rows.append(
-                    rate_row(method, split, name, "candidate_ranking", [o.ranked_first for o in here])
-                )
-        rows += pooled_rows(method, mine)
-    return rows
+                figures.append(rate_row(*place, "candidate_ranking", [o.ranked_first for o in here]))
+        figures += pooled_rows(method, mine)
+    return figures
 
 
 def pooled_rows(method: str, outcomes: Sequence[LoopOutcome]) -> list[Row]:
     """Means over the variants, and over all instructions of the controllability scenes, by scene."""
     by_scene: dict[int, list[LoopOutcome]] = {}
     for outcome in outcomes:
-        if outcome.episode.scene.split == "controllability":
+        if outcome.episode.scene.split == SPLIT:
             by_scene.setdefault(outcome.episode.scene.seed, []).append(outcome)
     scenes = [scene for scene in by_scene.values() if len(scene) == VARIANTS + 1]
     if not scenes:
         return []
-    split = "controllability"
     variants = [[o.success for o in scene if o.episode.variant > 0] for scene in scenes]
-    rows = [rate_row(method, split, "variants mean", "closed_loop_success", variants)]
+    figures = [rate_row(method, SPLIT, "variants mean", "closed_loop_success", variants)]
     if all(o.ranked_first is not None for scene in scenes for o in scene):
         ranked = [[o.ranked_first for o in scene] for scene in scenes]
-        rows.append(rate_row(method, split, "all", "candidate_ranking", ranked))
-    return rows
+        figures.append(rate_row(method, SPLIT, "all", "candidate_ranking", ranked))
+    return figures
 
 
-def headline(rows: Sequence[Row]) -> dict[str, float]:
-    """The figures that are asked for by name."""
-    wanted = {
-        "predicted_original": ("ours", "original", "predicted_success"),
-        "predicted_variants_mean": ("ours", "variants mean", "predicted_success"),
-        "wrong_text": ("wrong text", "all", "predicted_success"),
-        "copy_frame": ("copy frame", "all", "predicted_success"),
-        "true_frames": ("true frames", "all", "predicted_success"),
-        "closed_loop_original": ("ours", "original", "closed_loop_success"),
-        "closed_loop_variants_mean": ("ours", "variants mean", "closed_loop_success"),
-        "closed_loop_random": ("random candidate", "original", "closed_loop_success"),
-        "candidate_ranking": ("ours", "all", "candidate_ranking"),
-    }
-    found = {(row.method, row.variant, row.metric): row.value for row in rows}
-    return {name: round(found[key], 4) for name, key in wanted.items()}
+def _loop(found: Found) -> list[LoopOutcome]:
+    return [*found["closed loop"], *found["long goals"]]
 
 
-def seeds_used(
-    slot_seeds: Sequence[int], predicted: Sequence[PredictedScene], episodes: Sequence[LoopEpisode]
-) -> dict[str, list[int]]:
-    """Every seed, by what it was used for."""
-    seeds = {"slots": list(slot_seeds), "predicted scenes": [unit.scene.seed for unit in predicted]}
-    for episode in episodes:
-        known = seeds.setdefault(f"closed loop, {episode.scene.split}", [])
-        if episode.scene.seed not in known:
-            known.append(episode.scene.seed)
-    return seeds
+def column_of(episode: LoopEpisode) -> str:
+    """Title of its column."""
+    split = episode.scene.split
+    return list(PREDICTED_PLACES)[episode.variant] if split == SPLIT else OTHER_SPLITS[split]
+
+
+def _same_length(curves: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Shorter curves held at their last value."""
+    length = max(map(len, curves))
+    return [np.pad(curve, (0, length - len(curve)), mode="edge") for curve in curves]
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+PREDICTED_TABLE = TableSpec(
+    "Predicted success",
+    columns("predicted_success", {**PREDICTED_PLACES, "variants mean": (SPLIT, "variants mean")}),
+    lines(
+        PREDICTED,
+        {
+            "ours": "imagined with the sentence, judged on the imagined masks",
+            "true frames": "the parser on the simulator's frames: the ceiling",
+            "wrong text": "imagined with another sentence, judged for this one: must be near 0",
+            "copy frame": "the first frame repeated: must be near 0",
+        },
+    ),
+)
+LOOP_TABLE = TableSpec(
+    "Closed-loop success",
+    columns("closed_loop_success", LOOP_PLACES),
+    lines(
+        PLANNERS,
+        {
+            "ours": "imagine every instruction, score, act, look, replan; nothing from the simulator's state",
+            "random candidate": "the same loop with a random instruction instead of the best-scored one",
+        },
+    ),
+)
+DETAILS_TABLE = TableSpec(
+    "Ranking, steps and planning time",
+    columns("", LOOP_PLACES),
+    [
+        Line(key="ours", metric="candidate_ranking", label="candidate ranking, ours",
+             note="the best-scored is the one that was asked for"),
+        Line(key="ours, privileged", metric="candidate_ranking", label="candidate ranking, privileged",
+             kind="ceiling"),
+        Line(key="ours", metric="steps", digits=1, label="pick-and-places, ours", note="mean of all episodes"),
+        Line(key="expert", metric="steps", digits=1, label="pick-and-places, expert", kind="ceiling"),
+        Line(key="random candidate", metric="steps", digits=1, label="pick-and-places, random", kind="control"),
+        Line(key="ours", metric="seconds", label="seconds a plan, ours",
+             note="parse, imagine all candidates, score; one core, not in results.json"),
+    ],
+)  # fmt: skip
 
 
 def timings(outcomes: Sequence[LoopOutcome]) -> dict[str, dict[str, float]]:
     """Mean planning seconds, method -> column -> seconds."""
-    table: dict[str, dict[str, float]] = {}
-    for method in LOOP_METHODS:
-        for column in LOOP_COLUMNS:
-            seconds = [
-                o.planning_seconds
-                for o in outcomes
-                if (o.episode.method, o.episode.scene.split, o.episode.variant)
-                == (method, column.split, column.variant)
-                and o.planning_seconds is not None
-            ]
-            if seconds:
-                table.setdefault(method, {})[column.name] = round(float(np.mean(seconds)), 3)
-    return table
+    seconds: dict[str, dict[str, list[float]]] = {}
+    for o in outcomes:
+        if o.planning_seconds is not None:
+            its = seconds.setdefault(o.episode.method, {})
+            its.setdefault(column_of(o.episode), []).append(o.planning_seconds)
+    return {
+        method: {title: round(float(np.mean(its)), 3) for title, its in table.items()}
+        for method, table in seconds.items()
+    }
 
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    limits, figures = THRESHOLDS, list(results.rows)
+    seconds = [
+        Row("ours", *LOOP_PLACES[title], "seconds", value, value, value, 1)
+        for title, value in timings(_loop(found)).get("ours", {}).items()
+    ]
+    pictures = found["pictures"]
+    imagined = [clip for clip in pictures if clip.name.startswith("predicted")]
+    acted = [clip for clip in pictures if not clip.name.startswith("predicted")]
+    sections = [
+        Section(
+            "Predicted: does the imagined scene obey the sentence?",
+            "Each scene is imagined with its own instruction and with three that name another bowl. A rollout "
+            f"counts when the arm stays within {limits.arm_block_px:g} px of the named block for "
+            f"{limits.hold_frames} frames and the block ends within {limits.block_bowl_px:g} px of the named "
+            f"bowl's centre in the last {limits.settle_frames} frames, all read off the masks. The thresholds "
+            "were calibrated on the simulator's masks, never on predictions.",
+            [
+                PREDICTED_TABLE.table(figures),
+                plot_table("predicted.png", PREDICTED_TABLE, figures, label="predicted success"),
+                _distance_plot(found["predicted study"]),
+            ],
+        ),
+        Section(
+            "Imagined beside real",
+            "The best cases and the worst ones by where the block ends. Below the pictures: the slots' masks "
+            "beside the simulator's segmentation, one colour a thing.",
+            [Clips(imagined)],
+        ),
+        Section(
+            "Closed loop: does a robot that trusts it reach the goal?",
+            "The planner sees a picture and a goal, imagines the candidates, and the best one's masks become a "
+            "pick-and-place. PyBullet executes it and the simulator alone judges. Afterwards the planner looks "
+            "again and replans while it does not see the goal reached, up to three times for each block.",
+            [
+                LOOP_TABLE.table(figures),
+                plot_table("closed_loop.png", LOOP_TABLE, figures, label="closed-loop success",
+                           caption="Dots with 95 % intervals over scenes, judged by the simulator."),
+                DETAILS_TABLE.table([*figures, *seconds]),
+            ],
+        ),
+        Section(
+            "Planned beside executed",
+            "Long goals, and failures where there are any. Left: each chosen plan, imagined. Right: the camera.",
+            [Clips(acted)],
+        ),
+    ]  # fmt: skip
+    for shown in found["attention"]:
+        if shown is not None:
+            figure = heat_map(
+                "attention.png", shown.weights, shown.slots, shown.words, label="attention to words"
+            )
+            text = "Text-to-slot attention of the first best case, mean over layers, heads and frames."
+            sections.append(Section("Which words a slot attends to", text, [figure]))
+    return sections
+
+
+def _distance_plot(outcomes: Sequence[PredictedOutcome]) -> Figure:
+    curves = []
+    for title, name in (("imagined", "imagined_TV"), ("true frames", "true_TV")):
+        # Without the observed frame.
+        its = [column[1:] for outcome in outcomes for column in getattr(outcome, name).T]
+        distances = np.stack(_same_length(its))
+        distances[~np.isfinite(distances)] = FARTHEST  # what cannot be seen is farther off than what can
+        low, middle, high = np.quantile(distances, (0.1, 0.5, 0.9), axis=0)
+        curves.append((title, np.stack([middle, low, high], axis=1)))
+    return curve_plot(
+        "distance.png",
+        curves,
+        label="block to bowl, px",
+        across="frame",
+        caption="Distance of the named block to the named bowl: median, and the middle 80 % of all cases. One that "
+        f"cannot be seen counts as {FARTHEST} px.",
+        marks=[(THRESHOLDS.block_bowl_px, "counts as in the bowl")],
+    )
+
+
+def _card(label: str, method: str, variant: str, metric: str, compare: str = "") -> CardSpec:
+    return CardSpec(label, METHODS[method], Column("", SPLIT, variant, metric), compare)
+
+
+HEADLINE = {
+    "predicted_original": ("ours", SPLIT, "original", "predicted_success"),
+    "predicted_variants_mean": ("ours", SPLIT, "variants mean", "predicted_success"),
+    "wrong_text": ("wrong text", SPLIT, "all", "predicted_success"),
+    "copy_frame": ("copy frame", SPLIT, "all", "predicted_success"),
+    "true_frames": ("true frames", SPLIT, "all", "predicted_success"),
+    "closed_loop_original": ("ours", SPLIT, "original", "closed_loop_success"),
+    "closed_loop_variants_mean": ("ours", SPLIT, "variants mean", "closed_loop_success"),
+    "closed_loop_random": ("random candidate", SPLIT, "original", "closed_loop_success"),
+    "candidate_ranking": ("ours", SPLIT, "all", "candidate_ranking"),
+}
+STUDY = Study(
+    name="controllability",
+    title="Controllability",
+    question="Change the sentence and nothing else: does the world model imagine what it says, and can a robot that "
+    "plans with it do it?",
+    args=FullArgs,
+    sizes=lambda args: QUICK if args.quick else FULL if args.full else DEFAULT,
+    horizon=HORIZON,
+    methods=(*PREDICTED, *PLANNERS),
+    units=units,
+    cases=cases,
+    rows=rows,
+    tables=(PREDICTED_TABLE, LOOP_TABLE),
+    page=page,
+    cards=(
+        _card("Predicted, original instruction", "ours", "original", "predicted_success"),
+        _card("Predicted, three other bowls", "ours", "variants mean", "predicted_success"),
+        _card(
+            "Closed loop, original instruction", "ours", "original", "closed_loop_success", "not in the paper"
+        ),
+        _card(
+            "Closed loop, three other bowls",
+            "ours",
+            "variants mean",
+            "closed_loop_success",
+            "not in the paper",
+        ),
+        _card(
+            "Best-scored candidate is the right one", "ours", "all", "candidate_ranking", "not in the paper"
+        ),
+        _card("True frames, parsed", "true frames", "all", "predicted_success", "the ceiling"),
+        _card("Wrong text", "wrong text", "all", "predicted_success", "should be near 0"),
+        _card(
+            "Closed loop, random candidate",
+            "random candidate",
+            "original",
+            "closed_loop_success",
+            "the floor",
+        ),
+    ),
+    headline=HEADLINE,
+    first=(
+        "predicted_original",
+        "predicted_variants_mean",
+        "closed_loop_original",
+        "closed_loop_variants_mean",
+    ),
+    # Times are not in results.json, which must come out the same when a study is repeated.
+    files=lambda run, found: {"timings.json": json.dumps(timings(_loop(found)), indent=2) + "\n"},
+)
 
 if __name__ == "__main__":
-    start(main, Args)
+    start(STUDY)

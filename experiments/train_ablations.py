@@ -46,7 +46,7 @@ from textocvp.training.predictor import PredictorTraining
 from textocvp.training.predictor import train as train_predictor
 from textocvp.world_model import DEFAULT_CHECKPOINT, bundled_checkpoints
 
-SLOTS = ("slots-train.h5", "slots-val.h5")  # as `textocvp.training.predictor` names them
+SLOTS = ("slots-train.h5", "slots-val.h5")  # as `textocvp.training.run.predictor` names them
 
 
 @dataclass

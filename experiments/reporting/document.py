@@ -166,7 +166,7 @@ def _seed_text(seeds: Sequence[int]) -> str:
 def environment() -> Environment:
     """Where the templates of the pages are found; everything that is put into them is escaped."""
     return Environment(
-        loader=PackageLoader("experiments.reporting", "templates"),
+        loader=PackageLoader("experiments.report", "templates"),
         autoescape=select_autoescape(["html", "j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,

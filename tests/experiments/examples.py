@@ -6,21 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from experiments.reporting import (
-    Card,
-    Cell,
-    Checkpoint,
-    Clip,
-    Clips,
-    Report,
-    Results,
-    Row,
-    Section,
-    Table,
-    TableRow,
-)
-from experiments.reporting.clips import gif, paint, segmentation_colors
-from experiments.reporting.plots import Series, heat_map, interval_plot
+from experiments.report.gif import gif, paint, segmentation_colors
+from experiments.report.page import Card, Clip, Clips, Report, Section
+from experiments.report.plots import Series, heat_map, interval_plot
+from experiments.report.results import Checkpoint, Results
+from experiments.report.rows import Row
+from experiments.report.tables import Cell, Table, TableRow
 
 
 def row(value: float = 0.9, low: float = 0.8, high: float = 0.95, method: str = "ours") -> Row:

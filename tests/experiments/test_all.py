@@ -141,7 +141,9 @@ def test_a_program_that_is_missing_or_fails_is_a_sentence(args: Args, tmp_path: 
 def test_every_study_takes_what_it_is_told(study: Study, args: Args) -> None:
     if not (everything.ROOT / "experiments" / f"{study.name}.py").is_file():
         pytest.skip("not written yet")
-    known = {"--" + f.name.replace("_", "-") for f in fields(import_module(f"experiments.{study.name}").Args)}
+    module = import_module(f"experiments.{study.name}")
+    arguments = module.STUDY.args if hasattr(module, "STUDY") else module.Args
+    known = {"--" + f.name.replace("_", "-") for f in fields(arguments)}
     assert {option for option in study_options(study, args) if option.startswith("--")} <= known
 
 

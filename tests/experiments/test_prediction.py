@@ -15,7 +15,7 @@ from experiments.protocol.scenes import test_scenes
 from experiments.protocol.workers import Worker
 from experiments.reporting import Results
 from tests.experiments.oracle import LoadOracle
-from tests.experiments.test_films import LoadStill
+from tests.experiments.still import LoadStill
 from textocvp.metrics.jedi import jedi
 
 MEASURES = Measures(("st_lpips",), None, (), (("lpips", "no weights here"), ("jedi", "none there")))

@@ -7,51 +7,62 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.protocol.frame_scores import FrameScores, Measures
-from experiments.protocol.robustness import (
-    REREAD,
+from experiments.report.results import Checkpoint, Results
+from experiments.report.rows import Row
+from experiments.report.tables import as_percent
+from experiments.robustness import (
+    BARS,
+    REPARSED,
     SPLITS,
-    Column,
+    STUDY,
+    Figures,
     RobustOutcome,
     RobustScene,
+    Sizes,
+    bars_table,
     difference_rows,
+    doubt,
     drop_difference,
-    imagined_columns,
+    headline,
+    imagined_clips,
+    imagined_figures,
+    verdict,
 )
-from experiments.protocol.robustness_report import BARS, bars_table, doubt, percent, verdict
-from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import Worker
-from experiments.reporting import Checkpoint, Results, Row
-from experiments.robustness import Args, Sizes, choose_films, headline, main
+from experiments.study.frame_metrics import FrameScores, Measures
+from experiments.study.methods import Model
+from experiments.study.pool import Worker
+from experiments.study.run import Run, ScenesArgs, run
+from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
-from tests.experiments.test_films import STILL, LoadStill
+from tests.experiments.still import LoadStill
 
 ST_LPIPS = Measures(("st_lpips",), None, (), (("lpips", "no weights here"),))
-BARE = Measures((), None, (), ())
+BARE = Measures()
+STILL = Model("MAGE", LoadStill(), False, "still", "1" * 64, 12)
 
 
-def column(metric: str, test: list[float], unseen: list[float]) -> Column:
-    return Column("ours", "9 frames", metric, {"test": np.array(test), "unseen_colors": np.array(unseen)})
+def figures(metric: str, test: list[float], unseen: list[float]) -> Figures:
+    return Figures("ours", "9 frames", metric, {"test": np.array(test), "unseen_colors": np.array(unseen)})
 
 
 def test_a_drop_is_how_much_worse_a_figure_is() -> None:
     """.75 is a quarter less than 1; a distance of .06 is a fifth more than .05. Both are drops."""
-    success = column("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0])
+    success = figures("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0])
     assert success.drop("unseen_colors").value == pytest.approx(0.25)  # type: ignore[union-attr]
-    distance = column("st_lpips", [0.05, 0.05], [0.05, 0.07])
+    distance = figures("st_lpips", [0.05, 0.05], [0.05, 0.07])
     found = distance.drop("unseen_colors")
     assert found is not None and found.value == pytest.approx(0.2)
     assert (found.low, found.high) == pytest.approx((0.0, 0.4)) and found.n == 2
-    better = column("ssim", [0.8, 0.8], [0.88, 0.88]).drop("unseen_colors")
+    better = figures("ssim", [0.8, 0.8], [0.88, 0.88]).drop("unseen_colors")
     assert better is not None and (better.low, better.value, better.high) == pytest.approx((-0.1,) * 3)
-    assert column("iou", [0.0, 0.0], [0.5]).drop("unseen_colors") is None  # nothing to fall from
+    assert figures("iou", [0.0, 0.0], [0.5]).drop("unseen_colors") is None  # nothing to fall from
     assert success.drop("more_objects") is None
 
 
 def test_drops_are_compared_scene_by_scene() -> None:
     """Ours grows from .1 by a half and by nothing, MAGE by as much and a fifth more of its .2 in every scene."""
-    ours = column("st_lpips", [0.1, 0.1], [0.15, 0.1])
-    mage = Column(
+    ours = figures("st_lpips", [0.1, 0.1], [0.15, 0.1])
+    mage = Figures(
         "MAGE",
         "9 frames",
         "st_lpips",
@@ -65,15 +76,15 @@ def test_drops_are_compared_scene_by_scene() -> None:
         "unseen_colors",
         "st_lpips_drop_difference",
     )
-    ssim = column("ssim", [0.8, 0.8], [0.6, 0.6])
-    other = column("ssim", [0.8, 0.8], [0.4, 0.4])
+    ssim = figures("ssim", [0.8, 0.8], [0.6, 0.6])
+    other = figures("ssim", [0.8, 0.8], [0.4, 0.4])
     difference = drop_difference(ssim, other, "unseen_colors")
     assert difference is not None and difference.value == pytest.approx(-0.25)
-    assert drop_difference(ours, column("st_lpips", [0.1], [0.1]), "unseen_colors") is None
+    assert drop_difference(ours, figures("st_lpips", [0.1], [0.1]), "unseen_colors") is None
 
 
 def test_rows_of_a_figure() -> None:
-    rows = column("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0]).rows()
+    rows = figures("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0]).rows()
     assert [(r.split, r.metric, r.n) for r in rows] == [
         ("test", "closed_loop_success", 4),
         ("unseen_colors", "closed_loop_success", 4),
@@ -83,9 +94,9 @@ def test_rows_of_a_figure() -> None:
 
 
 def outcome(split: str, number: int, ssim: float, good: bool) -> RobustOutcome:
-    scene = test_scenes(split, number + 1, 0)[number]
+    scene = study_scenes(split, number + 1, 0)[number]
     scores = FrameScores("ours", {"ssim": np.full(24, ssim)}, {})
-    return RobustOutcome(scene, "", (scores,), {"ours": np.full(24, 0.5)}, {"ours": good})
+    return RobustOutcome(scene, (scores,), {"ours": np.full(24, 0.5)}, {"ours": good})
 
 
 def test_worst_cases_are_failures_first_and_never_of_the_test_set() -> None:
@@ -96,14 +107,14 @@ def test_worst_cases_are_failures_first_and_never_of_the_test_set() -> None:
         outcome("more_objects", 0, 0.8, False),
         outcome("more_objects", 1, 0.7, True),
     ]
-    shown = [(p.best, p.scene.split, p.good) for p in choose_films(outcomes, (), BARE, 0, 2)]
+    shown = [(p.best, p.scene.split, p.good) for p in imagined_clips(outcomes, (), BARE, 0, 2)]
     assert shown == [
         (True, "unseen_colors", True),
         (True, "more_objects", True),
         (False, "more_objects", False),
         (False, "unseen_colors", True),
     ]
-    found = {(c.metric, c.variant): c.values for c in imagined_columns(outcomes, ("ssim",))}
+    found = {(c.metric, c.variant): c.values for c in imagined_figures(outcomes, ("ssim",))}
     assert found["predicted_success", "whole episode"]["more_objects"].tolist() == [0.0, 1.0]
     assert found["ssim", "19 frames"]["unseen_colors"] == pytest.approx([0.9, 0.2])
 
@@ -122,7 +133,7 @@ def test_bars_are_passed_missed_or_undecided() -> None:
     assert verdict(drop, results(lpips_drop_unseen_colors=0.2, lpips_drop_unseen_colors_mage=0.2)) == "miss"
     assert verdict(drop, results(lpips_drop_unseen_colors=0.2)) == "undecided: no MAGE"
     assert verdict(drop, results()) == "undecided: no LPIPS"
-    assert percent(-0.064) == "-6.4 %" and percent(-0.0) == "0.0 %"
+    assert as_percent(-0.064) == "-6.4 %" and as_percent(-0.0) == "0.0 %"
 
 
 @pytest.mark.parametrize(
@@ -137,18 +148,23 @@ def test_a_verdict_that_the_interval_leaves_open_says_so(low: float, high: float
     assert cell.text == verdict(BARS[0], study) and cell.interval == said
 
 
-def test_without_a_learned_distance_its_headline_is_absent() -> None:
-    rows = Column("ours", "9 frames", "ssim", {"test": np.ones(2), "unseen_colors": np.ones(2)}).rows()
-    assert headline(rows, BARE) == {}
+def test_without_a_learned_distance_its_headline_is_absent(tmp_path: Path) -> None:
+    rows = Figures("ours", "9 frames", "ssim", {"test": np.ones(2), "unseen_colors": np.ones(2)}).rows()
+    args = ScenesArgs(out=tmp_path)
+    assert Run(STUDY, args, load=LoadOracle(), loads={}, measures=BARE).headline(rows) == {}
+    with_it = Run(STUDY, args, load=LoadOracle(), loads={}, measures=ST_LPIPS)
+    assert headline(with_it)["lpips_drop_unseen_colors_mage"] == (
+        "MAGE", "unseen_colors", "9 frames", "st_lpips_drop",
+    )  # fmt: skip
 
 
 def test_a_model_that_is_always_right_is_judged_right_with_and_without_its_own_masks() -> None:
-    (scene,) = test_scenes("more_objects", 1, 0)
+    (scene,) = study_scenes("more_objects", 1, 0)
     outcome = RobustScene(scene, (STILL,), BARE, 0).run(Worker(LoadOracle()()))
     assert outcome.success == {
-        "ours": True, REREAD: True, "true frames": True, "wrong text": False, "copy frame": True,
+        "ours": True, REPARSED: True, "true frames": True, "wrong text": False, "copy frame": True,
     }  # fmt: skip
-    # The double's parser knows what happened whatever it is shown, so REREAD and `copy frame` are right here too.
+    # The double's parser knows what happened whatever it is shown, so REPARSED and `copy frame` are right here too.
     assert outcome.mean("ours", "iou", 19) is not None and outcome.mean("MAGE", "iou", 19) is None
     assert len(outcome.scores[0].curves["ssim"]) == 19
     assert len(outcome.ious["MAGE"]) == 12 and "MAGE" not in outcome.success
@@ -157,11 +173,12 @@ def test_a_model_that_is_always_right_is_judged_right_with_and_without_its_own_m
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
-    main(
-        Args(out=out, quick=True, workers=1),
+    run(
+        STUDY,
+        ScenesArgs(out=out, quick=True, workers=1),
         load=LoadOracle(),
         sizes=Sizes(imagined=1, loop=1, controls=1, clips=1, acted=2),
-        baselines={"MAGE": LoadStill(24)},
+        loads={"MAGE": LoadStill(24)},
         measures=ST_LPIPS,
     )
     return out

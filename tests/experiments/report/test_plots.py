@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.reporting import Report, Section
-from experiments.reporting.grids import heat_grid, picture_grid
+from experiments.report.page import Report, Section
+from experiments.report.plots import heat_grid, picture_grid
 from tests.experiments import examples
 
 RED, BLUE = ((200, 0, 0), (0, 0, 200))

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.reporting import OutputFolder
+from experiments.study.run import OutputFolder
 
 
 def files(folder: Path) -> list[str]:

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from experiments.protocol.figures import mean_row, rate_row
-from experiments.reporting import Results, Row
+from experiments.report.results import Results
+from experiments.report.rows import Row, mean_row, rate_row
 from tests.experiments import examples
 
 

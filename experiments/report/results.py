@@ -1,0 +1,99 @@
+"""`results.json`: what a study measured, in the one form that can be checked by machine."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from experiments.report.rows import Row, is_number
+
+PACKAGES = ("textocvp", "torch", "numpy", "pybullet", "gymnasium")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Which weights were measured: the name they were asked for by, and the SHA-256 of the weights file."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """A whole `results.json`."""
+
+    study: str  # its name, as `controllability`
+    checkpoint: Checkpoint  # the weights
+    versions: Mapping[str, str]  # package name -> version; also the hashes of other weights
+    seeds: Mapping[str, Sequence[int]]  # every seed used, in groups: name -> seeds
+    quick: bool  # whether this was only the short first look
+    # how long it took. The only field that differs when a study is repeated with the same seed.
+    seconds: float
+    rows: Sequence[Row]  # the figures
+    # the few figures that a reader wants first, name -> number
+    headline: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, number in self.headline.items():
+            if not is_number(number):
+                raise ValueError(f"headline {name!r} must be a finite number, got {number!r}")
+
+    def find(self, method: str, variant: str, metric: str, split: str | None = None) -> Row | None:
+        """The first row of that method, variant and metric (and split), or None."""
+        for row in self.rows:
+            same = (row.method, row.variant, row.metric) == (method, variant, metric)
+            if same and split in (None, row.split):
+                return row
+        return None
+
+    def to_json(self) -> str:
+        """The text of `results.json`: stable order of keys, no NaN."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Results:
+        """The inverse of `to_json`.
+
+        Raises:
+            ValueError: if a field is missing, unknown or of the wrong kind; the message names it.
+        """
+        data = json.loads(text)
+        _check_names("results", data, cls)
+        _check_names("checkpoint", data["checkpoint"], Checkpoint)
+        if not isinstance(data["rows"], list):
+            raise ValueError("results.rows must be a list")
+        for row in data["rows"]:
+            _check_names("row", row, Row)
+        rows = [Row(**row) for row in data["rows"]]
+        return cls(**{**data, "checkpoint": Checkpoint(**data["checkpoint"]), "rows": rows})
+
+    @classmethod
+    def read(cls, path: str | Path) -> Results:
+        """Read a `results.json`."""
+        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that figures depend on; `not installed` where there is none."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def _check_names(what: str, data: Any, cls: type) -> None:
+    if not isinstance(data, dict):
+        raise ValueError(f"{what} must be an object, got {type(data).__name__}")
+    names = {f.name for f in fields(cls)}
+    if missing := sorted(names - set(data)):
+        raise ValueError(f"{what}: missing field {missing[0]!r}")
+    if unknown := sorted(set(data) - names):
+        raise ValueError(f"{what}: unknown field {unknown[0]!r}; known: {', '.join(sorted(names))}")

@@ -1,0 +1,145 @@
+"""Clips for a report: imagined beside real, the best cases and the worst ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
+from experiments.report.page import Clip, Tone
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome
+from experiments.study.mask_metrics import labels_of
+from experiments.study.methods import HORIZON, Model
+from experiments.study.pool import Worker
+from experiments.study.predictions import predict, slots_of, to_uint8
+from experiments.study.scenes import StudyScene, sample_scene
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PredictionClip:
+    """A unit of work: one scene, real and imagined by ours and other models; pictures above masks."""
+
+    scene: StudyScene  # which
+    models: tuple[Model, ...]  # the others
+    seed: int  # of the slots
+    group: str  # first part of the file's name
+    rank: int  # its place among the best or the worst
+    best: bool  # among which of the two
+    caption: str  # what it was ranked by
+    good: bool | None = None  # whether that is good in itself; None where only the rank is known
+    variant: int = 0  # which of the scene's instructions
+    variants: int = 0  # how many it has beside its own
+
+    def run(self, worker: Worker) -> Clip:
+        """Imagine and play it once more."""
+        truth, predictions = predict(
+            worker, self.scene, self.models, horizon=HORIZON, seed=self.seed, controls=False,
+            variant=self.variant, variants=self.variants,
+        )  # fmt: skip
+        info = truth.sampled.info
+        objects = len(info["objects"])
+        masks = [paint(truth.segmentations_THW, segmentation_colors(objects))]
+        for one in predictions:
+            rollout = slots_of(worker, one, self.seed)
+            labels_THW = labels_of(rollout)[0]
+            colors = slot_colors(labels_THW[0], info["segmentation"], rollout.slots.shape[2], objects)
+            masks.append(paint(labels_THW, colors))
+        # Pictures of many models are noisy and do not pack well; the page enlarges them itself.
+        scale = 2 if len(predictions) < 3 else 1
+        kind = "best" if self.best else "worst"
+        badge = f"{kind} {self.rank}"
+        if self.good is not None:
+            badge += ": success" if self.good else ": failure"
+        return Clip(
+            name=f"{self.group}-{kind}-{self.rank}.gif",
+            gif=gif(
+                [[truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)], masks], scale=scale
+            ),
+            panels=("real", *(one.method for one in predictions)),
+            title=truth.text,
+            caption=f"{self.caption}; seed {self.scene.seed}",
+            badge=badge,
+            tone=tone(self.good),
+        )
+
+
+@dataclass(frozen=True)
+class EpisodeClip:
+    """A unit of work: one episode of the closed loop, each plan as imagined beside what the camera saw."""
+
+    outcome: LoopOutcome  # of the episode
+    column: str  # of the table, for the caption
+    rank: int  # for the file's name
+
+    def run(self, worker: Worker) -> Clip:
+        """Play it once more."""
+        episode = self.outcome.episode
+        sampled = sample_scene(worker.environment(episode.scene), episode.scene, episode.variants)
+        result = episode.pursue(worker, sampled)
+        imagined = [to_uint8(attempt.plan.rollout.frames[0]) for attempt in result.attempts]
+        steps = f"{result.steps} pick-and-place" + ("s" if result.steps != 1 else "")
+        return Clip(
+            name=f"closed-loop-{self.rank}.gif",
+            gif=gif([[np.concatenate(imagined or [result.frames[:1]]), result.frames]]),
+            panels=("the plan, imagined", "what happened"),
+            title=self.outcome.text,
+            caption=f"{self.column}, seed {episode.scene.seed}; {steps}"
+            + (f"; {result.error}" if result.error else ""),
+            badge="success" if result.success else "failure",
+            tone=tone(result.success),
+        )
+
+
+def tone(good: bool | None) -> Tone:
+    """Colour of a badge."""
+    return "plain" if good is None else "good" if good else "bad"
+
+
+def episode_clips(
+    outcomes: Sequence[LoopOutcome], column_of: Callable[[LoopEpisode], str], count: int
+) -> list[EpisodeClip]:
+    """Up to `count` failures of ours, and successes with the longest goals: `2 * count` in all.
+
+    Args:
+        outcomes: of all methods.
+        column_of: title of the column that an episode stands in.
+        count: of failures.
+    """
+    ours = [o for o in outcomes if o.episode.method == "ours"]
+    failures = [o for o in ours if not o.success][:count]
+    successes = sorted((o for o in ours if o.success), key=lambda o: -o.episode.scene.steps)
+    chosen = successes[: 2 * count - len(failures)] if len(failures) < count else successes[:count]
+    return [EpisodeClip(o, column_of(o.episode), rank) for rank, o in enumerate(chosen + failures, start=1)]
+
+
+def extremes(cases: Sequence[T], badness: Sequence[float], count: int) -> tuple[list[T], list[T]]:
+    """The `count` best cases and the `count` worst ones, most extreme first; no case is both.
+
+    Of an odd number of cases too few for all, the best have one more.
+    """
+    order = [int(i) for i in np.argsort(np.asarray(badness), kind="stable")]
+    worst = min(count, len(cases) // 2)
+    best = min(count, len(cases) - worst)
+    return [cases[i] for i in order[:best]], [cases[i] for i in reversed(order[len(order) - worst :])]
+
+
+def extreme_clips(
+    cases: Sequence[T], badness: Sequence[float], count: int, make: Callable[[T, int, bool], PredictionClip]
+) -> list[PredictionClip]:
+    """The best cases and then the worst ones as clips. `make` gets a case, its rank from 1, and whether it is best."""
+    return [
+        make(case, rank, best)
+        for best, chosen in zip((True, False), extremes(cases, badness, count), strict=True)
+        for rank, case in enumerate(chosen, start=1)
+    ]
+
+
+def best_and_worst(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+    """Clips of the best cases and of the worst ones, in the order of `extreme_clips`."""
+    best = (len(clips) + 1) // 2
+    return list(clips[:best]), list(clips[best:])

@@ -1,0 +1,80 @@
+"""The closed loop: does a robot that plans in imagination reach the goal, judged by the simulator alone?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.study.methods import METHODS
+from experiments.study.pool import LoadModel, Worker
+from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene
+from planning import EpisodeResult, Goal, run_episode
+
+
+@dataclass(frozen=True)
+class LoopOutcome:
+    """What came of one episode."""
+
+    episode: LoopEpisode  # which one
+    text: str  # the goal
+    success: bool  # the simulator's verdict
+    believes_reached: bool | None  # the planner's own verdict; None for the expert
+    steps: int  # pick-and-places carried out
+    # whether the candidate that scored best is the one that the goal names; None for goals of several steps
+    # and for methods that do not rank
+    ranked_first: bool | None
+    planning_seconds: float | None  # mean time of a plan; None without one
+    error: str | None  # why the loop gave up, or None
+
+
+@dataclass(frozen=True)
+class LoopEpisode:
+    """A unit of work: one method, one scene, one goal."""
+
+    method: str  # key of who acts
+    scene: StudyScene  # where
+    variant: int = 0  # 0 for the scene's own instruction, i for its i-th variant with another target bowl
+    variants: int = 0  # how many variants there are
+    seed: int = 0  # of the slots and of chance
+    load: LoadModel | None = None  # makes the world model that is planned with; by default the study's own
+
+    def run(self, worker: Worker) -> LoopOutcome:
+        """Play the episode."""
+        env = worker.environment(self.scene)
+        sampled = sample_scene(env, self.scene, self.variants)
+        text = sampled.texts[self.variant]
+        if METHODS[self.method].expert:
+            played = play_expert(env, sampled, self.variant)
+            return LoopOutcome(self, text, played.success, None, played.steps, None, None, None)
+        result = self.pursue(worker, sampled)
+        goal = Goal.parse(text)
+        ranked_first = None
+        if METHODS[self.method].kind != "control" and len(goal.pairs) == 1:
+            ranked_first = bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.pairs
+        return LoopOutcome(
+            episode=self,
+            text=text,
+            success=result.success,
+            believes_reached=result.believes_reached,
+            steps=result.steps,
+            ranked_first=ranked_first,
+            planning_seconds=result.planning_seconds if result.attempts else None,
+            error=result.error,
+        )
+
+    def pursue(self, worker: Worker, sampled: SampledScene) -> EpisodeResult:
+        """Plan and act until the goal is believed to be reached, or the attempts are used up."""
+        goal, method = Goal.parse(sampled.texts[self.variant]), METHODS[self.method]
+        world_model = worker.world_model if self.load is None else worker.model(self.load)
+        # Seeded by scene and variant too: one stream for all episodes would depend on their order.
+        rng = np.random.default_rng([self.seed, self.scene.seed, self.variant])
+        assert method.plan is not None
+        return run_episode(
+            worker.environment(self.scene),
+            method.plan(world_model, goal, rng, self.seed),
+            goal,
+            seed=self.scene.seed,
+            options=sampled.options(self.variant),
+            privileged=method.privileged,
+        )

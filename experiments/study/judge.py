@@ -1,0 +1,111 @@
+"""Do imagined rollouts show what the sentence says? Judged on their masks (paper, section 4.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from experiments.study.methods import HORIZON
+from planning import (
+    Grounding,
+    GroundingError,
+    Imagines,
+    Instruction,
+    Judge,
+    PinholeCamera,
+    Trace,
+    ground,
+    measure_rollout,
+)
+from textocvp import Rollout
+
+
+@dataclass(frozen=True, eq=False)
+class Verdicts:
+    """One method on one scene, for its V instructions (original first) and S slot seeds."""
+
+    success_SV: np.ndarray  # bool
+    # distance in pixels between block and bowl over the last frames; inf where one is not seen
+    miss_SV: np.ndarray
+
+
+def find_things(
+    rollout: Rollout, camera: PinholeCamera, instructions: Sequence[Instruction]
+) -> Grounding | None:
+    """Which slot is what, by appearance on the first frame, which all rollouts of a batch share; None if unclear."""
+    try:
+        grounding = ground(rollout.select(0), camera)[0]
+    except GroundingError:
+        return None
+    return grounding.told([thing for i in instructions for thing in (i.block_thing, i.bowl_thing)])
+
+
+def trace(rollout: Rollout, grounding: Grounding | None, instructions: Sequence[Instruction]) -> Trace:
+    """The trace of each rollout for its instruction. What cannot be found in the picture is nowhere near."""
+    length = rollout.slots.shape[1]
+    rollout.decode_masks(range(length))  # all at once; the selections below find them decoded
+    traces = []
+    for b, instruction in enumerate(instructions):
+        try:
+            if grounding is None:
+                raise GroundingError
+            traces.append(measure_rollout(rollout.select(b), grounding, instruction))
+        except GroundingError:
+            nowhere = torch.full((1, length), torch.inf)
+            traces.append(Trace(tuple(range(length)), nowhere, nowhere))
+    return Trace(
+        traces[0].frames,
+        torch.cat([one.arm_block_Bt for one in traces]),
+        torch.cat([one.block_bowl_Bt for one in traces]),
+    )
+
+
+def first_frame(traced: Trace) -> Trace:
+    """The trace of the first frame repeated."""
+    shape = traced.arm_block_Bt.shape
+    return Trace(
+        traced.frames, traced.arm_block_Bt[:, :1].expand(shape), traced.block_bowl_Bt[:, :1].expand(shape)
+    )
+
+
+def judge(traced: Trace) -> tuple[Tensor, Tensor]:
+    """Success (V,) and miss (V,) of each rollout; see `Verdicts`."""
+    criterion = Judge()
+    return criterion(traced), traced.block_bowl_Bt[:, -criterion.thresholds.settle_frames :].mean(1)
+
+
+def stack(judged: Sequence[Sequence[Tensor]]) -> Verdicts:
+    """The verdicts of S slot seeds, each (success, miss)."""
+    success, miss = zip(*judged, strict=True)
+    return Verdicts(torch.stack(success).numpy(), torch.stack(miss).numpy())
+
+
+def judge_rollout(rollout: Rollout, camera: PinholeCamera, text: str) -> bool:
+    """Whether a rollout or a parsed video of a whole episode (B = 1) shows what the sentence says."""
+    instruction = Instruction.parse(text)
+    success_B, _ = judge(trace(rollout, find_things(rollout, camera, [instruction]), [instruction]))
+    return bool(success_B[0])
+
+
+def imagine_and_judge(
+    world_model: Imagines, rgb_HW3: np.ndarray, camera: PinholeCamera, texts: Sequence[str], seed: int
+) -> tuple[Rollout, Verdicts, Verdicts]:
+    """Imagine one scene with V instructions and one slot seed.
+
+    Returns:
+        the rollouts, one an instruction; the verdicts of each on its own instruction; and those on the next one of the
+        list, for which it was not imagined. Both (1, V).
+    """
+    instructions = [Instruction.parse(text) for text in texts]
+    parsed = world_model.parse(rgb_HW3[None], seed=seed)
+    rollout = world_model.rollout(parsed, list(texts), horizon=HORIZON, seed=seed)
+    grounding = find_things(rollout, camera, instructions)
+    ours, wrong = (
+        stack([judge(trace(rollout, grounding, asked))])
+        for asked in (instructions, instructions[1:] + instructions[:1])
+    )
+    return rollout, ours, wrong

@@ -1,0 +1,96 @@
+"""How well masks fit the simulator's segmentation, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from textocvp import Rollout
+from textocvp.metrics.masks import FIRST_OBJECT, foreground_ari, object_ious, overlaps, slot_labels
+
+ARM = 1  # its label in a segmentation
+
+
+@dataclass(frozen=True, eq=False)
+class MaskScores:
+    """How well the masks of T frames fit. All (T,), frame 0 is the observed one; nan where nothing of it is seen."""
+
+    # mean over the blocks and bowls that are seen; slots are matched to them afresh in every frame
+    # (Hungarian), as in the paper
+    iou: np.ndarray
+    # mean of the named block and the arm, the only things that move; matched as above, with the arm
+    moving: np.ndarray
+    block: np.ndarray  # these two by themselves
+    arm: np.ndarray
+    still: np.ndarray  # as `iou`, without the named block
+    # mean over blocks and bowls, each held against the one slot that was matched to it in frame 0: a model
+    # that lets two slots swap their objects loses here and nowhere else
+    kept: np.ndarray
+    kept_moving: np.ndarray  # the same for the named block and the arm
+    ari: np.ndarray  # adjusted Rand index over the foreground, arm included
+
+
+def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> MaskScores:
+    """Compare masks with the simulator's segmentation.
+
+    Args:
+        labels_THW: the slot that wins each pixel.
+        truth_THW: 0 background, 1 arm, 2 + i object i.
+        moved: value of the named block there.
+
+    Raises:
+        ValueError: if the two differ in size.
+    """
+    if labels_THW.shape != truth_THW.shape:
+        raise ValueError(f"labels are {labels_THW.shape}, the segmentation {truth_THW.shape}")
+    first = object_ious(labels_THW[0], _arm_as_object(truth_THW[0]))
+    held = dict(zip((first.ids - 1).tolist(), first.slots.tolist(), strict=True))
+    columns = []
+    for labels, truth in zip(labels_THW, truth_THW, strict=True):
+        objects = object_ious(labels, truth)
+        things = object_ious(labels, _arm_as_object(truth))
+        of = dict(zip((things.ids - 1).tolist(), things.ious.tolist(), strict=True))
+        block, arm = of.get(moved, np.nan), of.get(ARM, np.nan)
+        kept = _held_ious(labels, truth, held)
+        columns.append(
+            (
+                _mean(objects.ious),
+                _mean([block, arm]),
+                block,
+                arm,
+                _mean(objects.ious[objects.ids != moved]),
+                _mean([iou for i, iou in kept.items() if i >= FIRST_OBJECT]),
+                _mean([kept.get(moved, np.nan), kept.get(ARM, np.nan)]),
+                foreground_ari(labels, truth),
+            )
+        )
+    return MaskScores(*np.array(columns, dtype=np.float64).T)
+
+
+def _arm_as_object(truth: np.ndarray) -> np.ndarray:
+    """Every label but the background's one up, so that the metrics take the arm for the first object."""
+    return np.where(truth > 0, truth.astype(np.int64) + 1, 0)
+
+
+def _held_ious(labels: np.ndarray, truth: np.ndarray, held: Mapping[int, int]) -> dict[int, float]:
+    """Overlap of each thing that is seen with the slot it has been given; 0 if that slot shows nothing."""
+    ious, slots, ids = overlaps(labels, _arm_as_object(truth))
+    found = {}
+    for column, i in enumerate((ids - 1).tolist()):
+        if i in held:
+            row = np.flatnonzero(slots == held[i])
+            found[i] = float(ious[row[0], column]) if len(row) else 0.0
+    return found
+
+
+def _mean(values: object) -> float:
+    array = np.asarray(values, dtype=np.float64)
+    array = array[~np.isnan(array)]
+    return float(array.mean()) if len(array) else float("nan")
+
+
+def labels_of(rollout: Rollout) -> np.ndarray:
+    """The slot that wins each pixel, (B, T, H, W)."""
+    return slot_labels(rollout.masks)

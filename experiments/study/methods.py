@@ -1,0 +1,265 @@
+"""Every method of the studies: who is measured, its label, note and colour, its model or planner, the paper's figures.
+
+To compare another baseline or another planner, add one entry to `METHODS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from experiments.report.tables import Line, Paper
+from experiments.study.pool import LoadCheckpoint, LoadModel
+from planning import Goal, Imagines, InstructionPlanner, Planner, RandomPlanner, SequencePlanner
+from textocvp.checkpoint import CheckpointError
+
+HORIZON = 24
+"""Frames of an episode of the tabletop after the first one."""
+MakePlanner = Callable[[Imagines, Goal, np.random.Generator, int], Planner]
+"""Makes a planner of a world model, the goal of the episode, a source of chance, and the seed of the slots."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method(Line):
+    """A method. The fields of `Line` say how it is shown; these say what it is."""
+
+    model: str = ""  # bundled checkpoint of a model beside the study's own; empty for none
+    slots: bool = True  # whether that model has slots; if not, masks are read off its frames by our parser
+    train: str = ""  # what to type to train it
+    # makes the planner with which it acts in the closed loop; None for one that does not
+    plan: MakePlanner | None = None
+    privileged: bool = False  # whether its planner is told by the simulator's segmentation which slot is what
+    expert: bool = False  # whether it is the scripted expert
+
+    @property
+    def acts(self) -> bool:
+        """Whether it acts in the closed loop."""
+        return self.expert or self.plan is not None
+
+
+def _best(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
+    kind = InstructionPlanner if len(goal.pairs) == 1 else SequencePlanner
+    return kind(model, horizon=HORIZON, seed=seed)
+
+
+def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
+    return RandomPlanner(model, rng, horizon=HORIZON, seed=seed)
+
+
+def _paper_frames(
+    label: str,
+    ssim: Mapping,
+    lpips: Mapping,
+    jedi: Sequence[float],
+    drops: Mapping,
+    more: Mapping | None = None,
+) -> Paper:
+    """The paper's figures of predicted frames: split -> (at 9, at 19 frames) each."""
+    figures: dict[tuple[str, str, str], float] = dict(more or {})
+    for metric, table in (("ssim", ssim), ("lpips", lpips), ("jedi", {"test": jedi}), *drops.items()):
+        for split, values in table.items():
+            for length, value in zip((9, 19), values, strict=True):
+                if value is not None:
+                    figures[split, f"{length} frames", metric] = value
+    return Paper(label, figures)
+
+
+_OURS = _paper_frames(
+    "paper, TextOCVP",
+    ssim={"test": (0.950, 0.931), "unseen_colors": (0.946, 0.927), "more_objects": (0.936, 0.921)},
+    lpips={"test": (0.062, 0.078), "unseen_colors": (0.066, 0.083), "more_objects": (0.076, 0.090)},
+    jedi=(1.36, 2.23),
+    drops={
+        "ssim_drop": {"unseen_colors": (0.004, None), "more_objects": (0.015, 0.011)},
+        "lpips_drop": {"unseen_colors": (0.064, 0.064), "more_objects": (0.226, 0.154)},
+    },
+    more={
+        # Controllability: mean of 5 runs over 100 sequences.
+        **{
+            ("controllability", variant, "predicted_success"): value
+            for variant, value in zip(
+                ("original", "variant 1", "variant 2", "variant 3", "variants mean"),
+                (0.83, 0.86, 0.80, 0.81, 0.82),
+                strict=True,
+            )
+        },
+        ("test", "frames 1-9", "iou"): 0.573,
+        ("test", "frames 1-19", "iou"): 0.569,
+    },
+)
+_MAGE = _paper_frames(
+    "paper, MAGE-DINO",
+    ssim={"test": (0.940, 0.931), "unseen_colors": (0.935, 0.924), "more_objects": (0.929, 0.920)},
+    lpips={"test": (0.064, 0.075), "unseen_colors": (0.076, 0.087), "more_objects": (0.088, 0.094)},
+    jedi=(2.11, 2.59),
+    drops={
+        "ssim_drop": {"unseen_colors": (0.005, 0.007), "more_objects": (0.012, 0.012)},
+        "lpips_drop": {"unseen_colors": (0.19, 0.16), "more_objects": (0.375, 0.253)},
+    },
+)
+_TRUE_FRAMES = Paper(
+    "paper, parser on true frames",
+    {("test", "frames 1-9", "iou"): 0.554, ("test", "frames 1-19", "iou"): 0.553},
+)
+_COPY_SEED = Paper(
+    "paper, Copy-Seed", {("test", "frames 1-9", "iou"): 0.540, ("test", "frames 1-19", "iou"): 0.525}
+)
+_DATA = "--data data/tabletop-train.h5 --val data/tabletop-val.h5"
+_TRAIN_PREDICTOR = "textocvp train predictor --parser textocvp/checkpoints/tabletop-small"
+
+METHODS: dict[str, Method] = {
+    method.key: method
+    for method in (
+        Method(key="ours", hue=0, note="imagined from one frame and the sentence", plan=_best, paper=_OURS),
+        Method(
+            key="ours, 40 frames",
+            hue=7,
+            note="ours, trained on to look 40 frames ahead",
+            model="tabletop-small-40",
+            train=f"{_TRAIN_PREDICTOR} --finetune --set predictor.window=40 {_DATA} --out runs/window40 --steps 600 "
+            "--batch 16 --autoregressive 1.0 --horizon 20 --learning-rate 3e-4 --warmup 50",
+        ),
+        Method(
+            key="ours, frames parsed",
+            hue=0,
+            note="our parser reads the imagined frames, as it must for models without slots",
+        ),
+        Method(
+            key="ours, privileged",
+            kind="ceiling",
+            hue=3,
+            note="the same, but slots are named by the simulator's segmentation",
+            plan=_best,
+            privileged=True,
+        ),
+        Method(
+            key="OCVP-Seq",
+            kind="baseline",
+            hue=5,
+            note="slots, but no text",
+            model="ocvp-seq-small",
+            train=f"{_TRAIN_PREDICTOR} --preset ocvp-seq-small {_DATA} --out runs/ocvp-seq --steps 1500 "
+            "--autoregressive 1.0",
+        ),
+        Method(
+            key="Non-OC",
+            kind="baseline",
+            hue=6,
+            note="text, but one vector for the whole scene",
+            model="non-oc-small",
+            slots=False,
+            train=f"textocvp train parser --preset non-oc-small {_DATA} --out runs/non-oc-parser --steps 5000 "
+            "--clip 3 --stride 8 --batch 16 --learning-rate 2e-3 && "
+            f"textocvp train predictor --parser runs/non-oc-parser/checkpoint {_DATA} --out runs/non-oc "
+            "--autoregressive 1.0 --content-weight 1 --image-weight 10 --image-frames 2 --steps 1800",
+        ),
+        Method(
+            key="MAGE",
+            kind="baseline",
+            hue=3,
+            note="text, and codes of picture patches instead of objects",
+            model="mage-small",
+            slots=False,
+            paper=_MAGE,
+            train=f"textocvp train vqvae {_DATA} --out runs/vqvae --steps 1600 && "
+            f"textocvp train mage --vqvae runs/vqvae/checkpoint {_DATA} --out runs/mage --steps 1800 "
+            "--autoregressive 0.8 --changed-weight 1",
+        ),
+        Method(
+            key="true frames",
+            kind="ceiling",
+            hue=1,
+            note="parser and renderer on the true frames, nothing imagined",
+            paper=_TRUE_FRAMES,
+        ),
+        Method(
+            key="wrong text", kind="control", hue=4, note="imagined with a sentence that names something else"
+        ),
+        Method(key="copy frame", kind="control", hue=2, note="the first frame repeated"),
+        Method(
+            key="copy seed",
+            kind="control",
+            hue=2,
+            note="the first frame's masks held still",
+            paper=_COPY_SEED,
+        ),
+        Method(key="expert", kind="ceiling", hue=1, note="scripted, knows every pose", expert=True),
+        Method(
+            key="random candidate",
+            kind="control",
+            hue=2,
+            note="the same robot carries out a random instruction",
+            plan=_random,
+        ),
+    )
+}
+BASELINES = tuple(key for key, method in METHODS.items() if method.kind == "baseline")
+"""The models that ours is compared with, in the order of the tables."""
+PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)
+"""Who acts in the closed loop."""
+TRAINED_LITTLE = (
+    "The bundled baselines are small and were trained for minutes on two cores, as their cards say: none of them was "
+    "trained to the end."
+)
+"""To be said wherever they stand beside ours."""
+
+
+def lines(keys: Iterable[str], notes: Mapping[str, str] | None = None) -> tuple[Method, ...]:
+    """Methods as lines of a table, with other notes where those in `METHODS` do not fit.
+
+    Raises:
+        KeyError: if there is no such method.
+    """
+    notes = notes or {}
+    return tuple(replace(METHODS[key], note=notes.get(key, METHODS[key].note)) for key in keys)
+
+
+@dataclass(frozen=True)
+class Model:
+    """The model of a method, which is there."""
+
+    key: str  # of the method
+    load: LoadModel  # makes it
+    slots: bool  # see `Method`
+    checkpoint: str  # where it came from
+    sha256: str  # of its weights
+    longest: int | None  # how many frames it can imagine at once; None for any number
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A method that cannot be measured here, and why."""
+
+    key: str
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """Both, as a sentence."""
+        return f"{self.key} is absent: {self.reason}."
+
+
+def find_models(loads: Mapping[str, LoadModel]) -> tuple[tuple[Model, ...], tuple[Missing, ...]]:
+    """The models that are there, and those that are not with the reason, in the order of `METHODS`.
+
+    Args:
+        loads: key of a method -> makes its model.
+
+    Raises:
+        CheckpointError: if a checkpoint that is not the bundled one cannot be loaded: somebody has asked for it.
+    """
+    present, missing = [], []
+    for key in sorted(loads, key=list(METHODS).index):
+        method, load = METHODS[key], loads[key]
+        try:
+            model = load()
+        except CheckpointError:
+            if load != LoadCheckpoint(method.model):
+                raise
+            missing.append(Missing(key, f"not trained: `{method.train}`"))
+            continue
+        where = model.checkpoint
+        present.append(Model(key, load, method.slots, where.name, where.sha256, model.longest_horizon))
+    return tuple(present), tuple(missing)

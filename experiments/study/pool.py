@@ -1,0 +1,114 @@
+"""Work units on several processes, with results in order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, Protocol, TypeVar
+
+import gymnasium as gym
+import torch
+from joblib import Parallel, delayed
+
+from experiments.study.scenes import StudyScene
+from planning import Imagines
+from textocvp.protocols import load_model
+from textocvp.world_model import Checkpoint
+
+Out = TypeVar("Out", covariant=True)
+Model = TypeVar("Model")
+
+
+class StudyModel(Imagines, Protocol):
+    """A world model that knows where it came from."""
+
+    @property
+    def checkpoint(self) -> Checkpoint: ...
+
+    @property
+    def longest_horizon(self) -> int | None:
+        """How many frames it can imagine at once; None for any number."""
+        ...
+
+
+class LoadModel(Protocol):
+    """Makes a model. Hashable and equal for equal models, so that a process makes each only once."""
+
+    def __call__(self) -> Any: ...
+
+    def __hash__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class LoadCheckpoint:
+    """Loads a checkpoint of any architecture by its bundled name, folder or hub id."""
+
+    name: str
+
+    def __call__(self) -> Any:
+        return load_model(self.name)
+
+
+@dataclass
+class Worker:
+    """What a unit of work may use, made once a process."""
+
+    world_model: StudyModel  # the study's own
+    _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
+    _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
+
+    def model(self, load: Callable[[], Model]) -> Model:
+        """Another model, as a baseline. `load` must be hashable."""
+        if load not in self._models:
+            self._models[load] = load()
+        model: Model = self._models[load]
+        return model
+
+    def environment(self, scene: StudyScene) -> gym.Env[Any, Any]:
+        """The environment of a scene. Building it takes longer than resetting it, so it is kept."""
+        if scene.steps not in self._environments:
+            self._environments[scene.steps] = scene.make()
+        return self._environments[scene.steps]
+
+
+class Unit(Protocol[Out]):
+    """A unit of work: data that can be sent to another process, and what to do there."""
+
+    def run(self, worker: Worker) -> Out:
+        """Do the work. Must depend on nothing but the unit and the checkpoint."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Runs units on `processes` processes with one thread each, so that rounding is the same for any number."""
+
+    load: LoadModel  # makes the world model, once in each process
+    processes: int  # at least 1; with 1 everything runs in this process
+
+    def run(self, units: Sequence[Unit[Out]]) -> Iterator[Out]:
+        """The results, in the order of the units, as they become ready."""
+        if self.processes == 1 or not units:
+            yield from (_run(self.load, unit) for unit in units)
+        else:
+            parallel = Parallel(n_jobs=self.processes, return_as="generator", pre_dispatch=2 * self.processes)
+            yield from parallel(delayed(_run)(self.load, unit) for unit in units)
+
+
+def available_cores() -> int:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@lru_cache(maxsize=1)
+def _worker(load: LoadModel) -> Worker:
+    torch.set_num_threads(1)
+    return Worker(load())
+
+
+def _run(load: LoadModel, unit: Unit[Out]) -> Out:
+    return unit.run(_worker(load))

@@ -1,0 +1,148 @@
+"""The scenes of the studies, sampled by the environments from the seeds of a split: no data file is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envs import Expert, format_instruction, parse_instruction
+from envs.splits import SPLITS
+from textocvp.metrics.masks import FIRST_OBJECT
+
+LONG_GOALS = {"two_steps": 2, "three_steps": 3}
+"""Scenes of `test` seeds whose goals have 2 and 3 pairs."""
+SCENES_PER_SEED = 10_000
+
+
+@dataclass(frozen=True)
+class StudyScene:
+    """One scene of a split."""
+
+    split: str  # its name, one of the environments' splits or of `LONG_GOALS`
+    seed: int  # of the environment
+    # for `reset`; sorted items, so that a scene can be compared and hashed
+    options: tuple[tuple[str, Any], ...]
+    steps: int = 1  # pairs of the goal
+
+    def make(self) -> gym.Env[Any, Any]:
+        """The environment it is played in, which records the frames of its motions."""
+        if self.steps == 1:
+            return gym.make("PutBlockInBowl-v0", control="primitive", record_frames=True)
+        return gym.make("PutBlocksInBowls-v0", control="primitive", record_frames=True, n_pairs=self.steps)
+
+
+def study_scenes(split: str, count: int, seed: int) -> list[StudyScene]:
+    """`count` scenes of a split; each `seed` chooses other ones.
+
+    Raises:
+        ValueError: if there is no such split.
+    """
+    if split in LONG_GOALS:
+        # Seeds of the test split that no other study uses.
+        source, steps, first = SPLITS["test"], LONG_GOALS[split], 1_000 * LONG_GOALS[split]
+    elif split in SPLITS:
+        source, steps, first = SPLITS[split], 1, 0
+    else:
+        raise ValueError(f"unknown split {split!r}; known: {', '.join([*SPLITS, *LONG_GOALS])}")
+    scenes = []
+    for i in range(count):
+        one = source.seed(SCENES_PER_SEED * seed + first + i)
+        options = source.options(one) if steps == 1 else {"n_objects": 6, "color_split": "seen"}
+        scenes.append(StudyScene(split, one, tuple(sorted(options.items())), steps))
+    return scenes
+
+
+@dataclass(frozen=True, eq=False)
+class SampledScene:
+    """A scene as the environment sampled it."""
+
+    scene: StudyScene  # which
+    observation: Mapping[str, Any]  # of its reset
+    info: Mapping[str, Any]  # of its reset
+    texts: tuple[str, ...]  # its own instruction, then the variants
+
+    def options(self, variant: int) -> dict[str, Any]:
+        """`reset` options that, with the scene's seed, build it again with its `variant`-th text."""
+        if variant == 0:
+            return dict(self.scene.options)
+        # Another instruction would sample another scene from the same seed, so the objects are given.
+        return {"layout": self.info["objects"], "instruction": self.texts[variant]}
+
+    @property
+    def named_block(self) -> int:
+        """The segmentation's value of the block that the scene's own instruction names."""
+        (pair,) = parse_instruction(self.texts[0])
+        return FIRST_OBJECT + next(
+            item["id"]
+            for item in self.info["objects"]
+            if (item["kind"], item["color"]) == ("block", pair.block)
+        )
+
+
+def sample_scene(env: gym.Env[Any, Any], scene: StudyScene, variants: int = 0) -> SampledScene:
+    """Sample a scene, and name other target bowls for its block.
+
+    Which bowls and in which order is a function of the scene's seed alone.
+
+    Args:
+        env: from `scene.make()`.
+        scene: which.
+        variants: how many other target bowls to name.
+
+    Raises:
+        ValueError: if the scene has too few bowls for that many variants.
+    """
+    observation, info = env.reset(seed=scene.seed, options=dict(scene.options))
+    texts = [info["instruction"]]
+    if variants:
+        (pair,) = parse_instruction(texts[0])
+        bowls = [item["color"] for item in info["objects"] if item["kind"] == "bowl"]
+        others = sorted(color for color in bowls if color != pair.bowl)
+        if len(others) < variants:
+            raise ValueError(f"seed {scene.seed} has {len(others)} other bowls, not {variants}")
+        chosen = np.random.default_rng([scene.seed, 2]).permutation(others)[:variants].tolist()
+        texts += [format_instruction([(pair.block, bowl)]) for bowl in chosen]
+    return SampledScene(scene, observation, info, tuple(texts))
+
+
+def wrong_text(sampled: SampledScene) -> str:
+    """A sentence about the scene that names another block and another bowl than its own, as far as there are any.
+
+    A scene always has another block or another bowl. Which is named is a function of the scene's seed alone.
+    """
+    (pair,) = parse_instruction(sampled.texts[0])
+    rng = np.random.default_rng([sampled.scene.seed, 3])
+    named = {}
+    for kind, own in (("block", pair.block), ("bowl", pair.bowl)):
+        colors = sorted(item["color"] for item in sampled.info["objects"] if item["kind"] == kind)
+        others = [color for color in colors if color != own]
+        named[kind] = others[int(rng.integers(len(others)))] if others else own
+    return format_instruction([(named["block"], named["bowl"])])
+
+
+@dataclass(frozen=True, eq=False)
+class ExpertEpisode:
+    """What the scripted expert did."""
+
+    frames: np.ndarray  # (T, H, W, 3) uint8, from the first observation on
+    segmentations: np.ndarray  # (T, H, W): 0 background, 1 arm, 2 + i object i
+    success: bool  # the simulator's verdict
+    steps: int  # pick-and-places
+
+
+def play_expert(env: gym.Env[Any, Any], sampled: SampledScene, variant: int = 0) -> ExpertEpisode:
+    """Let the scripted expert carry out one of the scene's texts."""
+    _, info = env.reset(seed=sampled.scene.seed, options=sampled.options(variant))
+    frames, segmentations, steps = [info["frames"]], [info["frame_segmentations"]], 0
+    for action in Expert(env).actions():
+        info = env.step(action)[-1]
+        frames.append(info["frames"])
+        segmentations.append(info["frame_segmentations"])
+        steps += 1
+    return ExpertEpisode(
+        np.concatenate(frames), np.concatenate(segmentations), bool(info["is_success"]), steps
+    )
