@@ -32,7 +32,7 @@ from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
 from experiments.study.run import Found, FullArgs, Part, Run, Study, start
 from experiments.study.scenes import LONG_GOALS, StudyScene, play_expert, sample_scene, study_scenes
-from planning import THRESHOLDS, GroundingError, Instruction, PinholeCamera, Trace, ground
+from planning import RELATIONS, THRESHOLDS, AppearanceGrounder, GroundingError, Instruction, Trace
 from textocvp import WorldModel
 
 VARIANTS = 3
@@ -106,7 +106,7 @@ class PredictedScene:
         """Imagine, judge, and judge the controls."""
         env = worker.environment(self.scene)
         sampled = sample_scene(env, self.scene, self.variants)
-        texts, camera = list(sampled.texts), PinholeCamera.from_info(sampled.info["camera"])
+        texts, ground = list(sampled.texts), AppearanceGrounder.from_info(sampled.info)
         instructions = [Instruction.parse(text) for text in texts]
         # Rolling the list by one judges the rollout of each instruction for its neighbour in the list.
         others = instructions[1:] + instructions[:1]
@@ -116,7 +116,7 @@ class PredictedScene:
             rollout = worker.world_model.rollout(
                 sampled.observation["rgb"], texts, horizon=HORIZON, seed=seed
             )
-            grounding = find_things(rollout, camera, instructions)
+            grounding = find_things(rollout, ground, instructions)
             traced = trace(rollout, grounding, instructions)
             judged["ours"].append(judge(traced))
             judged["wrong text"].append(judge(trace(rollout, grounding, others)))
@@ -127,16 +127,16 @@ class PredictedScene:
             played = play_expert(env, sampled, variant)
             expert.append(played.success)
             parsed = worker.world_model.parse(played.frames, seed=self.slot_seeds[0])
-            true.append(trace(parsed, find_things(parsed, camera, [instruction]), [instruction]))
+            true.append(trace(parsed, find_things(parsed, ground, [instruction]), [instruction]))
         judged["true frames"] = [[torch.cat(column) for column in zip(*map(judge, true), strict=True)]]
         assert first is not None
-        true_Bt = [one.block_bowl_Bt[0].numpy() for one in true]
+        true_Bt = [one.distance_Bt[0].numpy() for one in true]
         return PredictedOutcome(
             scene=self.scene,
             texts=tuple(texts),
             verdicts={method: stack(parts) for method, parts in judged.items()},
             expert_V=np.array(expert),
-            imagined_TV=first.block_bowl_Bt.T.numpy(),
+            imagined_TV=first.distance_Bt.T.numpy(),
             true_TV=np.stack(_same_length(true_Bt), axis=1),
         )
 
@@ -171,10 +171,10 @@ class ReadAttention:
         if rollout.attention is None:
             return None
         instruction, words = Instruction.parse(text), tuple(model.model.text.words(text))
-        named = [instruction.block_thing, instruction.bowl_thing]
+        named = instruction.things
         try:
-            grounding = ground(rollout, PinholeCamera.from_info(sampled.info["camera"]))[0].told(named)
-            slots = {f"{thing.color} {thing.kind} (named)": grounding.find(thing) for thing in named}
+            grounding = AppearanceGrounder.from_info(sampled.info)(rollout).with_kinds(named)
+            slots = {f"{thing.color} {thing.kind} (named)": grounding.slots_of(thing) for thing in named}
             slots["arm"] = grounding.arm
         except GroundingError:
             return None
@@ -382,8 +382,8 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         Section(
             "Predicted: does the imagined scene obey the sentence?",
             "Each scene is imagined with its own instruction and with three that name another bowl. A rollout "
-            f"counts when the arm stays within {limits.arm_block_px:g} px of the named block for "
-            f"{limits.hold_frames} frames and the block ends within {limits.block_bowl_px:g} px of the named "
+            f"counts when the arm stays within {limits.contact_px:g} px of the named block for "
+            f"{limits.contact_frames} frames and the block ends within {RELATIONS['in'].within_px:g} px of the named "
             f"bowl's centre in the last {limits.settle_frames} frames, all read off the masks. The thresholds "
             "were calibrated on the simulator's masks, never on predictions.",
             [
@@ -442,7 +442,7 @@ def _distance_plot(outcomes: Sequence[PredictedOutcome]) -> Figure:
         across="frame",
         caption="Distance of the named block to the named bowl: median, and the middle 80 % of all cases. One that "
         f"cannot be seen counts as {FARTHEST} px.",
-        marks=[(THRESHOLDS.block_bowl_px, "counts as in the bowl")],
+        marks=[(RELATIONS["in"].within_px, "counts as in the bowl")],
     )
 
 

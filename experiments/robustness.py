@@ -35,7 +35,7 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from experiments.study.scenes import StudyScene, study_scenes
-from planning import PinholeCamera
+from planning import AppearanceGrounder
 from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
 SPLITS = {"test": "test set", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
@@ -111,7 +111,7 @@ class RobustScene:
         """Imagine, watch, measure."""
         truth, predictions = predict(worker, self.scene, self.models, horizon=HORIZON, seed=self.seed)
         scorer = Scorer(truth.frames_T3HW[: LENGTHS[-1] + 1], self.measures, upper=False)
-        camera = PinholeCamera.from_info(truth.sampled.info["camera"])
+        ground = AppearanceGrounder.from_info(truth.sampled.info)
         ious, success = {}, {}
         # Ours once more, judged as the models without slots must be: our parser reads the masks off its frames.
         for one in [*predictions, Prediction(REPARSED, predictions[0].frames_T3HW)]:
@@ -120,7 +120,7 @@ class RobustScene:
             true_THW = truth.segmentations_THW[: len(labels_THW)]
             ious[one.method] = score_masks(labels_THW, true_THW, truth.sampled.named_block).iou[1:]
             if len(labels_THW) > HORIZON:
-                success[one.method] = judge_rollout(rollout, camera, truth.text)
+                success[one.method] = judge_rollout(rollout, ground, truth.text)
         scores = tuple(
             scorer.score(Prediction(one.method, one.frames_T3HW[: LENGTHS[-1] + 1])) for one in predictions
         )

@@ -9,7 +9,7 @@ import numpy as np
 from experiments.study.methods import METHODS
 from experiments.study.pool import LoadModel, Worker
 from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene
-from planning import EpisodeResult, Goal, run_episode
+from planning import AppearanceGrounder, EpisodeResult, Goal, SegmentationGrounder, run_episode
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,10 @@ class LoopEpisode:
         result = self.pursue(worker, sampled)
         goal = Goal.parse(text)
         ranked_first = None
-        if METHODS[self.method].kind != "control" and len(goal.pairs) == 1:
-            ranked_first = bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.pairs
+        if METHODS[self.method].kind != "control" and len(goal.instructions) == 1:
+            ranked_first = (
+                bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.instructions
+            )
         return LoopOutcome(
             episode=self,
             text=text,
@@ -76,5 +78,5 @@ class LoopEpisode:
             goal,
             seed=self.scene.seed,
             options=sampled.options(self.variant),
-            privileged=method.privileged,
+            ground=(SegmentationGrounder if method.privileged else AppearanceGrounder).from_info,
         )

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from experiments.study.predictions import Prediction
-from textocvp.metrics.jedi import VJepaFeatures, load_vjepa
 from textocvp.metrics.frames import psnr, ssim
+from textocvp.metrics.jedi import VJepaFeatures, load_vjepa
 from textocvp.metrics.perceptual import MetricUnavailable, PerceptualDistance, load_lpips, load_st_lpips
 
 #: The second view leaves out the lowest rows of the picture. The robot stands beyond the upper edge, and its arm

@@ -11,14 +11,13 @@ from torch import Tensor
 
 from experiments.study.methods import HORIZON
 from planning import (
+    AppearanceGrounder,
     Grounding,
     GroundingError,
     Imagines,
     Instruction,
-    Judge,
-    PinholeCamera,
+    SuccessCriterion,
     Trace,
-    ground,
     measure_rollout,
 )
 from textocvp import Rollout
@@ -34,14 +33,14 @@ class Verdicts:
 
 
 def find_things(
-    rollout: Rollout, camera: PinholeCamera, instructions: Sequence[Instruction]
+    rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]
 ) -> Grounding | None:
     """Which slot is what, by appearance on the first frame, which all rollouts of a batch share; None if unclear."""
     try:
-        grounding = ground(rollout.select(0), camera)[0]
+        grounding = ground(rollout.select(0))
     except GroundingError:
         return None
-    return grounding.told([thing for i in instructions for thing in (i.block_thing, i.bowl_thing)])
+    return grounding.with_kinds([thing for one in instructions for thing in one.things])
 
 
 def trace(rollout: Rollout, grounding: Grounding | None, instructions: Sequence[Instruction]) -> Trace:
@@ -56,26 +55,27 @@ def trace(rollout: Rollout, grounding: Grounding | None, instructions: Sequence[
             traces.append(measure_rollout(rollout.select(b), grounding, instruction))
         except GroundingError:
             nowhere = torch.full((1, length), torch.inf)
-            traces.append(Trace(tuple(range(length)), nowhere, nowhere))
+            traces.append(Trace(tuple(range(length)), nowhere, nowhere, torch.zeros(1)))
     return Trace(
         traces[0].frames,
-        torch.cat([one.arm_block_Bt for one in traces]),
-        torch.cat([one.block_bowl_Bt for one in traces]),
+        torch.cat([one.contact_Bt for one in traces]),
+        torch.cat([one.distance_Bt for one in traces]),
+        torch.cat([one.within_B for one in traces]),
     )
 
 
 def first_frame(traced: Trace) -> Trace:
     """The trace of the first frame repeated."""
-    shape = traced.arm_block_Bt.shape
-    return Trace(
-        traced.frames, traced.arm_block_Bt[:, :1].expand(shape), traced.block_bowl_Bt[:, :1].expand(shape)
+    contact_Bt, distance_Bt = (
+        along_Bt[:, :1].expand_as(along_Bt) for along_Bt in (traced.contact_Bt, traced.distance_Bt)
     )
+    return Trace(traced.frames, contact_Bt, distance_Bt, traced.within_B)
 
 
 def judge(traced: Trace) -> tuple[Tensor, Tensor]:
     """Success (V,) and miss (V,) of each rollout; see `Verdicts`."""
-    criterion = Judge()
-    return criterion(traced), traced.block_bowl_Bt[:, -criterion.thresholds.settle_frames :].mean(1)
+    criterion = SuccessCriterion()
+    return criterion(traced), traced.distance_Bt[:, -criterion.thresholds.settle_frames :].mean(1)
 
 
 def stack(judged: Sequence[Sequence[Tensor]]) -> Verdicts:
@@ -84,15 +84,15 @@ def stack(judged: Sequence[Sequence[Tensor]]) -> Verdicts:
     return Verdicts(torch.stack(success).numpy(), torch.stack(miss).numpy())
 
 
-def judge_rollout(rollout: Rollout, camera: PinholeCamera, text: str) -> bool:
+def judge_rollout(rollout: Rollout, ground: AppearanceGrounder, text: str) -> bool:
     """Whether a rollout or a parsed video of a whole episode (B = 1) shows what the sentence says."""
     instruction = Instruction.parse(text)
-    success_B, _ = judge(trace(rollout, find_things(rollout, camera, [instruction]), [instruction]))
+    success_B, _ = judge(trace(rollout, find_things(rollout, ground, [instruction]), [instruction]))
     return bool(success_B[0])
 
 
 def imagine_and_judge(
-    world_model: Imagines, rgb_HW3: np.ndarray, camera: PinholeCamera, texts: Sequence[str], seed: int
+    world_model: Imagines, rgb_HW3: np.ndarray, ground: AppearanceGrounder, texts: Sequence[str], seed: int
 ) -> tuple[Rollout, Verdicts, Verdicts]:
     """Imagine one scene with V instructions and one slot seed.
 
@@ -103,7 +103,7 @@ def imagine_and_judge(
     instructions = [Instruction.parse(text) for text in texts]
     parsed = world_model.parse(rgb_HW3[None], seed=seed)
     rollout = world_model.rollout(parsed, list(texts), horizon=HORIZON, seed=seed)
-    grounding = find_things(rollout, camera, instructions)
+    grounding = find_things(rollout, ground, instructions)
     ours, wrong = (
         stack([judge(trace(rollout, grounding, asked))])
         for asked in (instructions, instructions[1:] + instructions[:1])

@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.report.tables import Line, Paper
 from experiments.study.pool import LoadCheckpoint, LoadModel
-from planning import Goal, Imagines, InstructionPlanner, Planner, RandomPlanner, SequencePlanner
+from planning import BeamPlanner, Goal, Imagines, Planner, RandomPlanner
 from textocvp.checkpoint import CheckpointError
 
 HORIZON = 24
@@ -40,12 +40,16 @@ class Method(Line):
 
 
 def _best(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
-    kind = InstructionPlanner if len(goal.pairs) == 1 else SequencePlanner
-    return kind(model, horizon=HORIZON, seed=seed)
+    if len(goal.instructions) > 1:
+        return BeamPlanner(model, horizon=HORIZON, seed=seed)
+    # One step: any sentence about the scene is a candidate, not only those that the goal asks for.
+    return BeamPlanner(
+        model, depth=1, candidates="scene", one_block_per_bowl=False, horizon=HORIZON, seed=seed
+    )
 
 
 def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
-    return RandomPlanner(model, rng, horizon=HORIZON, seed=seed)
+    return RandomPlanner(model, rng, depth=1, horizon=HORIZON, seed=seed)
 
 
 def _paper_frames(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from envs import Expert, format_instruction, parse_instruction
+from envs import Expert
 from envs.splits import SPLITS
-from textocvp.metrics.masks import FIRST_OBJECT
+from planning import Instruction, Thing
 
 LONG_GOALS = {"two_steps": 2, "three_steps": 3}
 """Scenes of `test` seeds whose goals have 2 and 3 pairs."""
@@ -75,12 +75,15 @@ class SampledScene:
     @property
     def named_block(self) -> int:
         """The segmentation's value of the block that the scene's own instruction names."""
-        (pair,) = parse_instruction(self.texts[0])
-        return FIRST_OBJECT + next(
-            item["id"]
-            for item in self.info["objects"]
-            if (item["kind"], item["color"]) == ("block", pair.block)
+        thing = Instruction.parse(self.texts[0]).thing
+        return next(
+            item["label"] for item in self.info["objects"] if Thing(item["color"], item["kind"]) == thing
         )
+
+    def others(self, thing: Thing) -> list[Thing]:
+        """The scene's other things of the same kind, sorted."""
+        things = [Thing(item["color"], item["kind"]) for item in self.info["objects"]]
+        return sorted(other for other in things if other.kind == thing.kind and other != thing)
 
 
 def sample_scene(env: gym.Env[Any, Any], scene: StudyScene, variants: int = 0) -> SampledScene:
@@ -97,16 +100,15 @@ def sample_scene(env: gym.Env[Any, Any], scene: StudyScene, variants: int = 0) -
         ValueError: if the scene has too few bowls for that many variants.
     """
     observation, info = env.reset(seed=scene.seed, options=dict(scene.options))
-    texts = [info["instruction"]]
-    if variants:
-        (pair,) = parse_instruction(texts[0])
-        bowls = [item["color"] for item in info["objects"] if item["kind"] == "bowl"]
-        others = sorted(color for color in bowls if color != pair.bowl)
-        if len(others) < variants:
-            raise ValueError(f"seed {scene.seed} has {len(others)} other bowls, not {variants}")
-        chosen = np.random.default_rng([scene.seed, 2]).permutation(others)[:variants].tolist()
-        texts += [format_instruction([(pair.block, bowl)]) for bowl in chosen]
-    return SampledScene(scene, observation, info, tuple(texts))
+    sampled = SampledScene(scene, observation, info, (info["instruction"],))
+    if not variants:
+        return sampled
+    own = Instruction.parse(sampled.texts[0])
+    others = sampled.others(own.target)
+    if len(others) < variants:
+        raise ValueError(f"seed {scene.seed} has {len(others)} other bowls, not {variants}")
+    order = np.random.default_rng([scene.seed, 2]).permutation(len(others))[:variants]
+    return replace(sampled, texts=(own.text, *(replace(own, target=others[i]).text for i in order)))
 
 
 def wrong_text(sampled: SampledScene) -> str:
@@ -114,14 +116,13 @@ def wrong_text(sampled: SampledScene) -> str:
 
     A scene always has another block or another bowl. Which is named is a function of the scene's seed alone.
     """
-    (pair,) = parse_instruction(sampled.texts[0])
+    own = Instruction.parse(sampled.texts[0])
     rng = np.random.default_rng([sampled.scene.seed, 3])
-    named = {}
-    for kind, own in (("block", pair.block), ("bowl", pair.bowl)):
-        colors = sorted(item["color"] for item in sampled.info["objects"] if item["kind"] == kind)
-        others = [color for color in colors if color != own]
-        named[kind] = others[int(rng.integers(len(others)))] if others else own
-    return format_instruction([(named["block"], named["bowl"])])
+    named = []
+    for thing in own.things:
+        others = sampled.others(thing)
+        named.append(others[int(rng.integers(len(others)))] if others else thing)
+    return Instruction(own.relation, *named).text
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
 from tests.experiments.still import LoadStill
-from textocvp.metrics.frames import psnr
 from textocvp.checkpoint import CheckpointError
+from textocvp.metrics.frames import psnr
 from textocvp.metrics.perceptual import load_st_lpips
 
 MEASURES = Measures(("st_lpips",))
