@@ -11,13 +11,14 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import ModelConfig, PredictorConfig, TextConfig
+from textocvp.config import ModelConfig, PredictorConfig
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatches
 from textocvp.data.slot_cache import SlotCache
 from textocvp.model import TextOCVP
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
+from textocvp.text.words import WordsConfig
 from textocvp.training import run as training
 from textocvp.training.evaluate_predictor import FollowingTest, Thing, ask, things_of
 from textocvp.training.losses import moving_weights, slot_loss
@@ -218,7 +219,7 @@ def test_recoloring_permutes_scene_and_words_alike():
 
 def test_words_without_rgb_stop_all_recoloring():
     """Else "red" would be taught to mean whatever colour the red block was given."""
-    text = build_text_encoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    text = build_text_encoder(WordsConfig(kind="transformer", dim=16, heads=2, hidden=16))
     plain, asked = (
         SlotBatches(scenes(), LAYOUT, text, 6, color_jitter=0.0, place_jitter=0.0, **settings)
         for settings in (dict(recolor=False, color_spread=0.0), dict(recolor=True, color_spread=0.5))
