@@ -136,7 +136,7 @@ def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(run):
     args = run(PLACED, "run")
     for setting, words in (
         ("text.kind=transformer", r"set predictor\.color_bias=false"),
-        ("predictor.layer=2", r"unknown setting 'predictor\.layer'"),
+        ("predictor.layer=2", r"predictor has no field 'layer'"),
         ("predictor.heads=3", "heads"),
     ):
         with pytest.raises(training.SettingsError, match=words):
