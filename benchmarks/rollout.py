@@ -27,7 +27,7 @@ import envs  # noqa: F401 (registers the environments)
 from planning.planners import watched_frames
 from planning.thresholds import THRESHOLDS
 from textocvp.model import TextOCVP
-from textocvp.predictors.textocvp import Predictor
+from textocvp.predictors.textocvp import TextOCVPPredictor
 from textocvp.presets import preset
 from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel, bundled_checkpoints
@@ -118,7 +118,7 @@ def measure(args: Benchmark) -> Figures:
     model = world_model.model
     parsed = world_model.parse(rgb[None])
     config = replace(model.config.predictor, attention="window", window=10, age_encoding="learned")
-    published = Predictor(config, model.config.parser.layout, model.config.text.dim).eval()
+    published = TextOCVPPredictor(config, model.config.parser.layout, model.config.text.dim).eval()
     weights = {name: value for name, value in model.predictor.state_dict().items() if name != "ages"}
     published.load_state_dict(weights, strict=False)
 
@@ -132,7 +132,7 @@ def measure(args: Benchmark) -> Figures:
     def imagining(count: int) -> Imagining:
         seed_B1KD, text = parsed.slots.expand(count, -1, -1, -1), model.text(texts[:count])
 
-        def seconds(predictor: Predictor, use_cache: bool) -> float:
+        def seconds(predictor: TextOCVPPredictor, use_cache: bool) -> float:
             return median_seconds(
                 lambda _: predictor.rollout(seed_B1KD, text, args.steps, use_cache=use_cache), args.repeats
             )

@@ -83,7 +83,7 @@ def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = N
     """
     run, sizes = StudyRun.open("interpretability", args, load), sizes or args.sizes
     model = run.world_model
-    if isinstance(model, WorldModel) and not model.model.predictor.hears_text:
+    if isinstance(model, WorldModel) and not model.model.predictor.uses_text:
         raise UsageError(f"{args.checkpoint} hears no text, so there is no attention to read")
     pool = run.pool
     splits = dict.fromkeys(split for split, _ in COLUMNS.values())

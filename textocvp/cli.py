@@ -309,7 +309,7 @@ def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
         weights = f"textocvp train vqvae --preset {name}, then train mage"
     else:
         images, predictor = config.parser, [model.predictor]
-        parts = [part for part in model.children() if part is not model.text or model.predictor.hears_text]
+        parts = [part for part in model.children() if part is not model.text or model.predictor.uses_text]
         weights = f"textocvp train parser --preset {name}, then train predictor"
         if name != shipped.name and (config.parser, config.renderer) == (shipped.parser, shipped.renderer):
             weights = f"textocvp train predictor --preset {name} on the parser of {shipped.name}"

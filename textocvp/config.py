@@ -13,49 +13,14 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_ty
 
 from textocvp.parsers import PARSERS, ParserConfig
 from textocvp.parsers.placed import PlacedConfig
+from textocvp.predictors import PREDICTORS, PredictorConfig
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers import RENDERERS, RendererConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.text import ENCODERS, TextConfig
 from textocvp.text.words import WordsConfig
 
 C = TypeVar("C")
-
-
-@dataclass(frozen=True)
-class PredictorConfig:
-    """From slots and text to the slots of the next frame.
-
-    Attributes:
-        kind: `textocvp` (published) or `ocvp-seq` (a baseline that hears no text: `layers` of object attention, then
-            time attention).
-        dim: token width. layers, heads, hidden: the transformer (`hidden` of every feed-forward net).
-        attention: `window` (published: bidirectional over the last `window` frames, recomputed each step) or
-            `causal` (each frame sees itself and its past; keys and values are cached).
-        window: the longest past, in frames. For `causal` also the longest rollout it can be trained or used for.
-        age_encoding: `learned` (published) or `sinusoidal`, one code per frame, the same for all its slots.
-        residual: predict the change of the slots instead of the slots (published).
-        color_bias: add the colour-matching term to the text-to-slot attention (needs the lexicon encoder and explicit
-            slot colours).
-        feed_forwards: feed-forward nets a layer: 2 as the authors' code, 1 as the text.
-        standardize: read and change content in units of its deviation over the training slots. Always done with
-            explicit slots; the published model does not.
-    """
-
-    kind: Literal["textocvp", "ocvp-seq"] = "textocvp"
-    dim: int = 512
-    layers: int = 8
-    heads: int = 8
-    hidden: int = 1024
-    attention: Literal["window", "causal"] = "window"
-    window: int = 10
-    age_encoding: Literal["learned", "sinusoidal"] = "learned"
-    residual: bool = True
-    color_bias: bool = False
-    feed_forwards: Literal[1, 2] = 2
-    standardize: bool = False
-
-
-PREDICTORS = {"textocvp": PredictorConfig, "ocvp-seq": PredictorConfig}
 
 
 @dataclass(frozen=True)
@@ -81,7 +46,7 @@ class ModelConfig:
     parser: ParserConfig = field(default_factory=PlacedConfig)
     renderer: RendererConfig = field(default_factory=GlimpseConfig)
     text: TextConfig = field(default_factory=WordsConfig)
-    predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    predictor: PredictorConfig = field(default_factory=TextOCVPConfig)
     stage: Literal["parser", "predictor"] = "predictor"
 
     def to_dict(self) -> dict[str, Any]:

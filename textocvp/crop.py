@@ -1,9 +1,8 @@
-"""Reading a slot's pixels into a small canonical picture, and drawing that picture back where the slot is.
+"""Crops the pixels of a slot into a small canonical picture, and pastes such a picture back at the slot's place.
 
-A slot that knows its place and size can be described in its own coordinates: the same block looks the same wherever
-it stands. Reading and drawing are axis-aligned, so each is two small matrix products (the separable attention of
-DRAW, Gregor et al. 2015) and differentiable in place and size. The explicit place follows Invariant Slot Attention
-(Biza et al. 2023).
+In its own coordinates a thing looks the same wherever it stands. Both ways are axis-aligned, so each is two small
+matrix products (the separable attention of DRAW, Gregor et al. 2015) and differentiable in place and size. The explicit
+place follows Invariant Slot Attention (Biza et al. 2023).
 """
 
 from __future__ import annotations
@@ -12,48 +11,57 @@ import torch
 from torch import Tensor
 
 NOTHING = -12.0
-"""Alpha logit outside a glimpse and in unused slots; the background's is 0."""
-
-
-def _cell_centers(center: Tensor, scale: Tensor, cells: int, extent: float) -> tuple[Tensor, Tensor]:
-    """Positions (..., cells) of the canonical cells along one axis of the image (-1..1), and their spacing (..., 1)."""
-    steps = (torch.arange(cells, device=center.device, dtype=center.dtype) + 0.5) / cells * 2 - 1
-    reach = scale[..., None] * extent
-    return center[..., None] + reach * steps, 2 * reach / cells
-
-
-def reading_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
-    """(..., cells, pixels): each canonical cell as a weighted mean of the pixels under it, along one axis.
-
-    Args:
-        center, scale: (...) place and standard deviation of the slot along this axis, in -1..1.
-    """
-    where, spacing = _cell_centers(center, scale, cells, extent)
-    pixel = (torch.arange(pixels, device=center.device, dtype=center.dtype) + 0.5) / pixels * 2 - 1
-    width = spacing.clamp_min(2 / pixels)[..., None]  # never narrower than a pixel: interpolate, do not skip
-    hat = (1 - (where[..., None] - pixel).abs() / width).clamp_min(0)
-    return hat / hat.sum(-1, keepdim=True).clamp_min(0.5)  # cells outside the image fade to 0
-
-
-def drawing_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
-    """(..., pixels, cells): each pixel as a linear interpolation of the canonical cells around it, along one axis."""
-    where, spacing = _cell_centers(center, scale, cells, extent)
-    pixel = (torch.arange(pixels, device=center.device, dtype=center.dtype) + 0.5) / pixels * 2 - 1
-    return (1 - (pixel[:, None] - where[..., None, :]).abs() / spacing[..., None]).clamp_min(0)
+"""Alpha logit outside a pasted picture and in unused slots; the background's is 0."""
 
 
 def crop(images: Tensor, position: Tensor, scale: Tensor, cells: int, extent: float) -> Tensor:
-    """Canonical pictures (B, K, C, cells, cells) of images (B, K, C, H, W) around position and scale (B, K, 2)."""
-    rows = reading_weights(position[..., 1], scale[..., 1], images.shape[-2], cells, extent)
-    columns = reading_weights(position[..., 0], scale[..., 0], images.shape[-1], cells, extent)
+    """Crop canonical pictures.
+
+    Args:
+        images: (B, K, C, H, W).
+        position, scale: (B, K, 2) place and standard deviation (x, y) of each slot, in -1..1.
+        cells: along a side of the picture.
+        extent: how many standard deviations the picture reaches to each side.
+
+    Returns:
+        (B, K, C, cells, cells); cells outside the image are 0.
+    """
+    rows = _crop_weights(position[..., 1], scale[..., 1], images.shape[-2], cells, extent)
+    columns = _crop_weights(position[..., 0], scale[..., 0], images.shape[-1], cells, extent)
     return rows[:, :, None] @ images @ columns[:, :, None].transpose(-1, -2)
 
 
 def paste(
     pictures: Tensor, position: Tensor, scale: Tensor, height: int, width: int, extent: float
 ) -> Tensor:
-    """Images (B, K, C, H, W) with the canonical pictures (B, K, C, cells, cells) at position and scale (B, K, 2)."""
+    """Paste canonical pictures (B, K, C, cells, cells) into images (B, K, C, height, width) of zeros; see `crop`."""
     cells = pictures.shape[-1]
-    rows = drawing_weights(position[..., 1], scale[..., 1], height, cells, extent)
-    columns = drawing_weights(position[..., 0], scale[..., 0], width, cells, extent)
+    rows = _paste_weights(position[..., 1], scale[..., 1], height, cells, extent)
+    columns = _paste_weights(position[..., 0], scale[..., 0], width, cells, extent)
     return rows[:, :, None] @ pictures @ columns[:, :, None].transpose(-1, -2)
+
+
+def _crop_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
+    """(..., cells, pixels): each cell as a weighted mean of the pixels under it, along one axis."""
+    where, spacing = _cells(center, scale, cells, extent)
+    width = spacing.clamp_min(2 / pixels)[..., None]  # never narrower than a pixel: interpolate, do not skip
+    hat = (1 - (where[..., None] - _centers(pixels, center)).abs() / width).clamp_min(0)
+    return hat / hat.sum(-1, keepdim=True).clamp_min(0.5)  # cells outside the image fade to 0
+
+
+def _paste_weights(center: Tensor, scale: Tensor, pixels: int, cells: int, extent: float) -> Tensor:
+    """(..., pixels, cells): each pixel as a linear interpolation of the cells around it, along one axis."""
+    where, spacing = _cells(center, scale, cells, extent)
+    apart = _centers(pixels, center)[:, None] - where[..., None, :]
+    return (1 - apart.abs() / spacing[..., None]).clamp_min(0)
+
+
+def _cells(center: Tensor, scale: Tensor, cells: int, extent: float) -> tuple[Tensor, Tensor]:
+    """Centres (..., cells) of the canonical cells along one axis of the image (-1..1), and their spacing (..., 1)."""
+    reach = scale[..., None] * extent
+    return center[..., None] + reach * _centers(cells, center), 2 * reach / cells
+
+
+def _centers(count: int, like: Tensor) -> Tensor:
+    """(count,) centres of as many equal parts of -1..1."""
+    return (torch.arange(count, device=like.device, dtype=like.dtype) + 0.5) / count * 2 - 1

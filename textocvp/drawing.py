@@ -1,5 +1,4 @@
-"""Pictures of rollouts: frames above masks, one stable colour a slot, enlarged so that a person can see
-something."""
+"""Pictures of rollouts: frames and masks, enlarged, with one stable colour for each slot."""
 
 from __future__ import annotations
 
@@ -13,11 +12,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 SUFFIXES = (".gif", ".mp4", ".png")
-#: A picture in a film is enlarged to about this many pixels a side, one in a strip to about half of it.
-READABLE = 256
-#: A strip shows at most this many moments, and a film at most this many sequences side by side.
-STRIP_MOMENTS, FILM_COLUMNS = 12, 6
-GAP = 4
+READABLE = 256  # pixels a side to which a picture in a film is enlarged; one in a strip to half of it
+STRIP_MOMENTS = 12  # the most that a strip shows
+FILM_COLUMNS = 6  # the most sequences side by side in a film
+GAP = 4  # pixels between pictures
 PAPER, INK = (250, 250, 250), (30, 30, 30)
 
 
@@ -32,8 +30,7 @@ def slot_palette(num_slots: int) -> np.ndarray:
 
 
 def color_masks(masks: np.ndarray) -> np.ndarray:
-    """Masks (..., K, H, W) as pictures (..., H, W, 3) uint8: each pixel the mask-weighted mix of the slots'
-    colours."""
+    """Masks (..., K, H, W) as pictures (..., H, W, 3) uint8: the slots' colours, mixed by the masks."""
     mixed = np.einsum("...khw,kc->...hwc", masks, slot_palette(masks.shape[-3]))
     return (mixed.clip(0, 1) * 255).round().astype(np.uint8)
 
@@ -55,12 +52,15 @@ def save_film(
     """Write sequences as a film (`.gif`, `.mp4`) or a strip (`.png`).
 
     Args:
-        path: where to; missing folders are made.
+        path: missing folders are made.
         frames: (B, T, 3, H, W) RGB 0..1.
         masks: (B, T, K, H, W).
         texts: B captions, or none.
         beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, drawn before the imagined ones.
-        fps: frames a second.
+        fps: frames per second.
+
+    Returns:
+        The path.
 
     Raises:
         ValueError: if the suffix is another one, or `beside` has another shape.
@@ -103,41 +103,33 @@ def _real_frames(beside: np.ndarray, B: int, T: int, H: int, W: int) -> np.ndarr
 
 
 def _screen(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
-    """One moment of a film. One sequence lies on its side: (real,) imagined, slots. Of several, each is a column,
-    at most `FILM_COLUMNS` of them side by side.
-
-    Args:
-        pictures: (B, rows, H, W, 3) uint8.
-        captions: B texts.
-    """
+    """One moment (B, rows, H, W, 3) of a film. A single sequence lies on its side; of several, each is a column."""
     if len(captions) == 1:
         factor = max(1, READABLE // pictures.shape[2])
-        # Without a text nothing was imagined: the frames are true ones, drawn again from their slots.
+        # Without a text nothing was imagined: the frames are true ones, redrawn from their slots.
         names = ("real", "imagined" if captions[0] else "redrawn", "slots")[-pictures.shape[1] :]
         panels = [_captioned(_framed(enlarge(p, factor)), n) for p, n in zip(pictures[0], names, strict=True)]
         return _captioned(_beside(panels), captions[0])
-    factor = max(1, READABLE // 2 // pictures.shape[2])
-    columns = [
-        _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in sequence], axis=0), caption)
-        for sequence, caption in zip(pictures, captions, strict=True)
-    ]
+    columns = [_column(rows, caption) for rows, caption in zip(pictures, captions, strict=True)]
     lines = [columns[i : i + FILM_COLUMNS] for i in range(0, len(columns), FILM_COLUMNS)]
     return _stack([_beside(line) for line in lines])
 
 
 def _strip(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
-    """All moments from left to right, sequences under each other. `pictures` (B, T, rows, H, W, 3) uint8."""
+    """Moments (B, T, rows, H, W, 3) from left to right, sequences under each other."""
     T = pictures.shape[1]
     moments = np.unique(np.linspace(0, T - 1, min(T, STRIP_MOMENTS)).round().astype(int))
-    factor = max(1, READABLE // 2 // pictures.shape[3])
-    bands = []
-    for sequence, caption in zip(pictures, captions, strict=True):
-        columns = [
-            _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in sequence[t]], axis=0), f"t = {t}")
-            for t in moments
-        ]
-        bands.append(_captioned(_beside(columns), caption))
+    bands = [
+        _captioned(_beside([_column(sequence[t], f"t = {t}") for t in moments]), caption)
+        for sequence, caption in zip(pictures, captions, strict=True)
+    ]
     return _stack(bands)
+
+
+def _column(rows: np.ndarray, caption: str) -> np.ndarray:
+    """Pictures (rows, H, W, 3) under each other, at half the size of a film of one sequence."""
+    factor = max(1, READABLE // 2 // rows.shape[1])
+    return _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in rows], axis=0), caption)
 
 
 def _framed(picture: np.ndarray) -> np.ndarray:
@@ -155,15 +147,12 @@ def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _fill(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    return np.pad(
-        picture,
-        ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0)),
-        constant_values=PAPER[0],
-    )
+    missing = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+    return np.pad(picture, missing, constant_values=PAPER[0])
 
 
 def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
-    """The picture with its text on a band of paper below; without a text, the picture as it is."""
+    """The picture with its text, if it has one, on a band of paper below."""
     if not text:
         return picture
     font = ImageFont.load_default()

@@ -1,4 +1,4 @@
-"""What a user asks of a model, checked: frames it may look at, texts it may hear, a horizon it can reach."""
+"""Checks of what a user asks of a model: frames, texts, horizon, and whether they go together."""
 
 from __future__ import annotations
 
@@ -36,25 +36,20 @@ def observed_images(obs: Mapping[str, Any] | np.ndarray) -> np.ndarray:
 def checked_frames(
     images: np.ndarray, image_size: tuple[int, int], device: torch.device, what: str = "the observation"
 ) -> Tensor:
-    """(N, H, W, 3) uint8 images as frames (N, 3, H, W) in -1..1.
+    """Images (N, H, W, 3) uint8 as frames (N, 3, H, W) in -1..1.
 
     Args:
-        image_size: (H, W) of the only frames that the model understands.
-        what: what to call them in messages.
+        image_size: (H, W) that the model was trained on.
+        what: what messages call the images.
 
     Raises:
         TypeError: if they are not uint8.
-        ValueError: if shape or size are others, or the values cannot be those of a picture.
+        ValueError: if the shape or size is another one, or the values cannot be those of a picture.
     """
     H, W = image_size
     if images.dtype != np.uint8:
-        hint = ""
-        if (
-            np.issubdtype(images.dtype, np.floating)
-            and images.size
-            and 0 <= images.min() <= images.max() <= 1
-        ):
-            hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)"
+        in_0_1 = images.dtype.kind == "f" and images.size and 0 <= images.min() <= images.max() <= 1
+        hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)" if in_0_1 else ""
         raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
     if images.shape[-1] != 3 or images.shape[0] == 0:
         raise ValueError(
@@ -62,8 +57,8 @@ def checked_frames(
         )
     if images.shape[1:3] != (H, W):
         raise ValueError(
-            f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} "
-            "and no other size: render or resize to that"
+            f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} and no other "
+            "size: render or resize to that"
         )
     if images.max() == 1:
         raise ValueError(
@@ -74,10 +69,10 @@ def checked_frames(
 
 
 def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int = 3) -> list[str]:
-    """One sentence or several as a list. A word that the encoder has never met is a `UserWarning` that names it.
+    """One sentence or several as a list. A word that the encoder does not know is a `UserWarning` that names it.
 
     Args:
-        depth: calls between this function and the user's line, which the warning shows.
+        depth: stack level of the user's line, seen from the caller; the warning shows that line.
 
     Raises:
         TypeError: if one is no string.
@@ -90,12 +85,12 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
         if not isinstance(sentence, str):
             raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
         if not sentence.strip():
-            raise ValueError("an empty text; say what is to be done: 'put the red block in the blue bowl'")
+            raise ValueError("an empty text; write what is to be done: 'put the red block in the blue bowl'")
     unknown = list(dict.fromkeys(word for sentence in texts for word in encoder.unknown_words(sentence)))
     if unknown:
         words = ", ".join(map(repr, unknown))
         warnings.warn(
-            f"the text encoder has never met {words}: what is imagined may be as if it were not there",
+            f"the text encoder has never met {words}: the rollout may be as if it were not there",
             UserWarning,
             stacklevel=depth + 1,
         )
@@ -117,14 +112,13 @@ def checked_horizon(horizon: int, longest: int | None, hint: str = "") -> None:
 
 
 def checked_pairs(scenes: int, sentences: int) -> int:
-    """How many sequences `scenes` and `sentences` make: as many of each, or one of either for all of the other.
+    """The number of sequences. There must be as many scenes as sentences, or one of either for all of the other.
 
     Raises:
-        ValueError: if they do not go together.
+        ValueError: if there are not.
     """
     if scenes != sentences and scenes != 1 and sentences != 1:
         raise ValueError(
-            f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as "
-            "many of each"
+            f"{scenes} scenes and {sentences} texts do not go together: give one scene, one text, or as many of each"
         )
     return max(scenes, sentences)

@@ -1,11 +1,6 @@
-"""The transformer pieces that text encoder and predictor share.
+"""Building blocks that several parts of the models share: attention, position codes, initial weights.
 
-On a CPU PyTorch's fused attention takes 0.75 of the time of matmul, softmax, matmul in float32 (forward and
-backward, 8 x 4 x 216 x 216, heads of 32), but 1.8 times as long in bfloat16, where its backward pass is the
-trap. So each is used where it is faster, and the plain form wherever the map itself is wanted.
-
-Shape suffixes: B batch, N tokens that ask, M tokens that are asked, L words, C width, h heads, d width of a
-    head.
+Shape suffixes: B batch, N tokens that ask, M tokens that are asked, L words, C width, h heads, d width of a head.
 """
 
 from __future__ import annotations
@@ -17,8 +12,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# Added to the logits of what may not be attended. Finite, so that a row with nothing to attend to is not NaN.
+# Added to the logits of what may not be attended to. Finite, so that a row without any token is not NaN.
 MASKED = -1e9
+
+
+def mask_bias(masked: Tensor) -> Tensor:
+    """Logit terms of the same shape: `MASKED` where `masked` is True, else 0."""
+    return torch.zeros(masked.shape, device=masked.device).masked_fill(masked, MASKED)
 
 
 def attend(q_BhNd: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -48,37 +48,37 @@ def join_heads(x_BhNd: Tensor) -> Tensor:
 
 
 class KeyValueCache:
-    """Keys and values of the tokens seen so far in one layer.
-
-    Without gradients they live in a buffer of the final size, written in place. With gradients they are
-    concatenated, because autograd may not see a buffer change that it still needs.
-    """
+    """Keys and values of the tokens that one layer has seen, at most `capacity` of them."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.length = 0
-        self._keys: Tensor | None = None
-        self._values: Tensor | None = None
+        self._seen: list[Tensor] = []  # keys and values
 
     def append(self, k_BhNd: Tensor, v_BhNd: Tensor) -> tuple[Tensor, Tensor]:
-        """Add tokens; returns all keys and all values (B, h, M, d)."""
-        end = self.length + k_BhNd.shape[2]
+        """Add N tokens.
+
+        Returns:
+            Keys and values of all M tokens, each (B, h, M, d).
+
+        Raises:
+            ValueError: if M is more than the capacity.
+        """
+        start, end = self.length, self.length + k_BhNd.shape[2]
         if end > self.capacity:
             raise ValueError(f"the cache holds {self.capacity} tokens, {end} were given")
+        added, self.length = [k_BhNd, v_BhNd], end
+        # Autograd must not see a buffer change that it still needs, so with gradients tokens are concatenated.
         if torch.is_grad_enabled():
-            first = self._keys is None or self._values is None
-            self._keys = k_BhNd if first else torch.cat([self._keys, k_BhNd], dim=2)  # type: ignore[list-item]
-            self._values = v_BhNd if first else torch.cat([self._values, v_BhNd], dim=2)  # type: ignore[list-item]
-            self.length = end
-            return self._keys, self._values
-        if self._keys is None or self._values is None:
-            batch, heads, _, width = k_BhNd.shape
-            self._keys = k_BhNd.new_empty(batch, heads, self.capacity, width)
-            self._values = v_BhNd.new_empty(batch, heads, self.capacity, width)
-        self._keys[:, :, self.length : end] = k_BhNd
-        self._values[:, :, self.length : end] = v_BhNd
-        self.length = end
-        return self._keys[:, :, :end], self._values[:, :, :end]
+            pairs = zip(self._seen, added, strict=True)
+            self._seen = [torch.cat(pair, dim=2) for pair in pairs] if self._seen else added
+            return self._seen[0], self._seen[1]
+        # Without gradients they are written into buffers of the final size: nothing is copied twice.
+        if not self._seen:
+            self._seen = [x.new_empty(*x.shape[:2], self.capacity, x.shape[3]) for x in added]
+        for buffer, x in zip(self._seen, added, strict=True):
+            buffer[:, :, start:end] = x
+        return self._seen[0][:, :, :end], self._seen[1][:, :, :end]
 
 
 class SelfAttention(nn.Module):
@@ -96,14 +96,13 @@ class SelfAttention(nn.Module):
         self,
         x_BMC: Tensor,
         bias: Tensor | None,
-        *,
         newest: int | None = None,
         cache: KeyValueCache | None = None,
     ) -> Tensor:
-        """Attend from the `newest` last tokens (default: all) to all of them and to those in the cache.
+        """Attend from the last `newest` tokens (default: all) to all tokens and to those in the cache.
 
         Returns:
-            (B, N, C), N = newest.
+            (B, N, C), where N is `newest`.
         """
         dim = x_BMC.shape[-1]
         if newest is None:
@@ -115,6 +114,7 @@ class SelfAttention(nn.Module):
         if cache is not None:
             k_BhMd, v_BhMd = cache.append(k_BhMd, v_BhMd)
         q_BhNd = split_heads(q_BNC, self.heads)
+        # On a CPU the fused attention takes 0.75 of the time of `attend` in float32, but 1.8 of it in bfloat16.
         if q_BhNd.device.type == "cpu" and q_BhNd.dtype != torch.float32:
             values_BhNd, _ = attend(q_BhNd, k_BhMd, v_BhMd, bias)
         else:
@@ -123,8 +123,7 @@ class SelfAttention(nn.Module):
 
 
 class TextAttention(nn.Module):
-    """Cross-attention from slots to words. The words' keys and values do not change during a rollout: ask
-    once."""
+    """Cross-attention from slots to words. Keys and values are apart, because a rollout needs them only once."""
 
     def __init__(self, dim: int, heads: int, text_dim: int) -> None:
         super().__init__()
@@ -144,7 +143,7 @@ class TextAttention(nn.Module):
     def forward(
         self, x_BNC: Tensor, keys_values: tuple[Tensor, Tensor], bias: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Returns what the words say to each token (B, N, C), and the attention (B, h, N, L)."""
+        """The text's update of each token (B, N, C), and the attention (B, h, N, L)."""
         values_BhNd, weights_BhNL = attend(split_heads(self.q(x_BNC), self.heads), *keys_values, bias)
         return self.out(join_heads(values_BhNd)), weights_BhNL
 
@@ -157,20 +156,16 @@ class FeedForward(nn.Sequential):
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast switched off on a device; what is computed within is as precise as its inputs."""
-    if device.type == "meta":  # for shapes only; it has no autocast to switch off
+    """Switch autocast off: what is computed within is as precise as its inputs."""
+    if device.type == "meta":  # it has no autocast
         return nullcontext()
     return torch.autocast(device.type, enabled=False)
 
 
 def pixel_grid(height: int, width: int, *, device: torch.device | str | None = None) -> Tensor:
-    """Where the pixel centres lie in the unit of `SlotState.position`.
+    """The pixel centres in the unit of `SlotState.position`, (height, width, 2) of (x, y), float32.
 
-    The picture's edges are at -1 and 1, so the first of W pixel centres is at 1/W - 1; a position p is at
-    `(p + 1) / 2 * W` pixels, where the first centre is 0.5.
-
-    Returns:
-        (height, width, 2) of (x, y), float32.
+    The picture's edges are at -1 and 1, so the first of W pixel centres is at 1/W - 1.
     """
     y = (torch.arange(height, device=device, dtype=torch.float32) + 0.5) * (2 / height) - 1
     x = (torch.arange(width, device=device, dtype=torch.float32) + 0.5) * (2 / width) - 1
@@ -179,7 +174,7 @@ def pixel_grid(height: int, width: int, *, device: torch.device | str | None = N
 
 
 class PositionCode(nn.Module):
-    """Adds a learned linear code of each location's distance to the four edges to a feature map."""
+    """Adds to a feature map a learned linear code of each location's distances to the four edges."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -193,9 +188,10 @@ class PositionCode(nn.Module):
 
 
 def init_relu_(module: nn.Module) -> None:
-    """Initial weights with which ReLU layers pass the picture on at its size (He et al. 2015).
+    """Initial weights with which ReLU layers keep the scale of their input (He et al. 2015).
 
-    With PyTorch's own it shrinks layer by layer, and an autoencoder draws the mean picture for hundreds of updates.
+    With PyTorch's own the signal shrinks from layer to layer, and an autoencoder draws the mean picture for hundreds
+    of updates.
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from textocvp.config import ModelConfig, PredictorConfig
+from textocvp.config import ModelConfig
 from textocvp.parsers.holistic import HolisticConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.parsers.savi import SaviConfig
+from textocvp.predictors.ocvp_seq import OCVPSeqConfig
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers.broadcast import BroadcastConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.patches import FeatureConfig, PatchConfig
@@ -15,16 +17,10 @@ from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
 from textocvp.text.words import GRAMMAR, TRAIN_COLORS, WordsConfig
 
-SMALL = PredictorConfig(
-    dim=128, layers=3, heads=4, hidden=256, attention="causal", window=24, feed_forwards=1
-)
-SMALL_SEQ = PredictorConfig(
-    kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24
-)
-PUBLISHED = PredictorConfig()
-PUBLISHED_SEQ = PredictorConfig(
-    kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal"
-)
+SMALL = TextOCVPConfig(dim=128, layers=3, heads=4, hidden=256, attention="causal", window=24, feed_forwards=1)
+SMALL_SEQ = OCVPSeqConfig(dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24)
+PUBLISHED = TextOCVPConfig()
+PUBLISHED_SEQ = OCVPSeqConfig(dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal")
 PUBLISHED_TEXT = WordsConfig(
     kind="transformer", dim=512, heads=8, hidden=1024, vocabulary=GRAMMAR + TRAIN_COLORS
 )

@@ -1,14 +1,15 @@
-"""What every model of the comparison can do, with slots or without: watch a frame, read a sentence, imagine frames.
+"""What others may ask of a model, and how they get one.
 
-`WorldModel` can, for everything that has slots; the holistic baselines have a class of their own. The studies of
-prediction quality know no more of a model than this.
+A `VideoModel` imagines frames, with slots or without. A `SlotModel` also gives its slots, as `WorldModel` does.
+Whatever has these methods is one, so a study that asks for no more also runs on a test double.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,30 +18,31 @@ from torch import Tensor
 from textocvp.baselines.mage.config import ARCHITECTURE
 from textocvp.baselines.mage.video import MageVideoModel
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, read_json, resolve_checkpoint
+from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
+
+Model = TypeVar("Model", covariant=True)
 
 
 class VideoModel(Protocol):
-    """A video prediction model.
+    """A video prediction model."""
 
-    Attributes:
-        checkpoint: where it came from.
-    """
-
-    checkpoint: Checkpoint
+    @property
+    def checkpoint(self) -> Checkpoint:
+        """Where it came from."""
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(H, W) of the only frames that it understands, in pixels."""
+        """(H, W) in pixels of the frames that it was trained on; it takes no others."""
 
     @property
     def longest_horizon(self) -> int | None:
-        """How many frames it can imagine at once; None for as many as you like."""
+        """How many frames it can imagine at once; None for any number."""
 
     def imagine(
         self, obs: Mapping[str, Any] | np.ndarray, text: str | Sequence[str], *, horizon: int, seed: int = 0
     ) -> Tensor:
-        """Frames (B, horizon + 1, 3, H, W), RGB 0..1, float32. Frame 0 is the observed one as the model redraws it.
+        """Frames (B, horizon + 1, 3, H, W), RGB 0..1, float32. Frame 0 is the observed one, redrawn by the model.
 
         Args:
             obs: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images (B, H, W, 3), uint8.
@@ -53,10 +55,59 @@ class VideoModel(Protocol):
         """
 
 
+class SlotModel(VideoModel, Protocol):
+    """A video prediction model with slots; its methods are described in `WorldModel`."""
+
+    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+        """The slots of a true video (T, H, W, 3)."""
+
+    def rollout(
+        self,
+        obs: Mapping[str, Any] | np.ndarray | Rollout,
+        text: str | Sequence[str],
+        *,
+        horizon: int = 24,
+        seed: int = 0,
+        attention: bool = False,
+    ) -> Rollout:
+        """Imagine the next frames."""
+
+    def words(self, text: str) -> list[str]:
+        """What the last axis of `Rollout.attention` stands for."""
+
+
+class LoadModel(Protocol[Model]):
+    """Makes a model. Hashable, and equal for equal models, so that a process makes each only once."""
+
+    def __call__(self) -> Model: ...
+
+    def __hash__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class LoadCheckpoint:
+    """Loads any checkpoint, see `load_model`."""
+
+    name: str
+
+    def __call__(self) -> VideoModel:
+        return load_model(self.name)
+
+
+@dataclass(frozen=True)
+class LoadWorldModel:
+    """Loads a checkpoint with slots, see `WorldModel.from_pretrained`."""
+
+    name: str
+
+    def __call__(self) -> WorldModel:
+        return WorldModel.from_pretrained(self.name)
+
+
 def load_model(
     name_or_folder_or_hub_id: str | Path = DEFAULT_CHECKPOINT, device: str | torch.device = "cpu"
 ) -> VideoModel:
-    """The model of a checkpoint, whatever its architecture; arguments and errors as `WorldModel.from_pretrained`."""
+    """The model of a checkpoint of any architecture; arguments and errors as `WorldModel.from_pretrained`."""
     name = str(name_or_folder_or_hub_id)
     with resolve_checkpoint(name) as folder:
         if read_json(folder).get("architecture") == ARCHITECTURE:

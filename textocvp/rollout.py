@@ -1,8 +1,7 @@
-"""What the world model imagined, or parsed: slots, and whatever can be read off them, decoded only when
-asked for.
+"""What the world model imagined or parsed: slots, and all that can be read off them.
 
-Decoding costs several times more than predicting. A planner that scores thirty instructions needs masks at a
-few frames and colours at none, so nothing is drawn before somebody looks at it, and nothing is drawn twice.
+Decoding costs several times more than predicting, and a planner needs masks at a few frames only. So nothing is drawn
+before it is asked for, and nothing is drawn twice.
 """
 
 from __future__ import annotations
@@ -20,9 +19,8 @@ from textocvp.layers import pixel_grid
 from textocvp.renderers.base import Renderer
 from textocvp.slots import SlotLayout, SlotState
 
-#: How many pictures the renderer draws at once: large enough to keep two cores busy, small enough for the
-#: cache.
 CHUNK = 64
+"""Pictures that the renderer draws at once: enough to keep two cores busy, and small enough for their cache."""
 
 
 @dataclass
@@ -35,11 +33,10 @@ class _Decoded:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rollout:
-    """A batch of B sequences of T frames with K slots each. Frame 0 is what was observed; the others are
-    imagined.
+    """B sequences of T frames with K slots each. Frame 0 is observed, the others are imagined.
 
-    All tensors are float32 without gradient, on the model's device. Slots keep their number through time:
-    slot 3 of frame 20 is the thing that was slot 3 in frame 0.
+    All tensors are float32 without gradient, on the model's device. Slots keep their number through time: slot 3 of
+    frame 20 is the thing that was slot 3 in frame 0.
 
     Attributes:
         slots: (B, T, K, D).
@@ -60,58 +57,70 @@ class Rollout:
 
     def __repr__(self) -> str:
         B, T, K, D = self.slots.shape
-        said = ", ".join(repr(text) for text in self.texts[:2]) + (", ..." if len(self.texts) > 2 else "")
-        what = f"imagined from {said}" if self.texts else "parsed from frames"
+        texts = ", ".join(map(repr, self.texts[:2])) + (", ..." if len(self.texts) > 2 else "")
+        what = f"imagined from {texts}" if self.texts else "parsed from frames"
         H, W = self.image_size
-        drawn = (
-            f"masks decoded at {len(self._decoded.masks)}, frames at {len(self._decoded.frames)} of {T} times"
-        )
+        masks, frames = len(self._decoded.masks), len(self._decoded.frames)
+        drawn = f"masks decoded at {masks}, frames at {frames} of {T} times"
         return f"Rollout(B={B} sequences, T={T} frames, K={K} slots of {D}, {H}x{W} pixels, {what}; {drawn})"
 
     def __len__(self) -> int:
         """B, the number of sequences."""
         return self.slots.shape[0]
 
-    # ---------------------------------------------------------------- what the slots look like
+    # ---- what the slots look like
 
     def decode_masks(self, frames: slice | Sequence[int]) -> Tensor:
-        """Masks (B, t, K, H, W) of only these frames; they sum to 1 over the slots.
+        """Masks (B, t, K, H, W) of only these frames; see `masks`.
 
         Raises:
             IndexError: if there is no such frame.
         """
-        return self._decode(frames, self._decoded.masks, self._draw_masks)
+        times, decoded = self._times(frames), self._decoded.masks
+        new = [t for t in dict.fromkeys(times) if t not in decoded]
+        if new:
+            (masks_BtKHW,) = self._draw(new, lambda slots: (self.renderer.masks(slots).float(),))
+            decoded.update(zip(new, masks_BtKHW.unbind(1), strict=True))
+        return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_frames(self, frames: slice | Sequence[int]) -> Tensor:
-        """Pictures (B, t, 3, H, W) of only these frames, RGB 0..1.
+        """Pictures (B, t, 3, H, W) of only these frames; see `frames`.
 
         Raises:
             IndexError: if there is no such frame.
         """
-        return self._decode(frames, self._decoded.frames, self._draw_frames)
+
+        def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
+            rendered = self.renderer(slots_NKD)
+            return _to_rgb(rendered.frames_B3HW), rendered.masks_BKHW.float()
+
+        times, decoded = self._times(frames), self._decoded.frames
+        new = [t for t in dict.fromkeys(times) if t not in decoded]
+        if new:
+            frames_Bt3HW, masks_BtKHW = self._draw(new, draw)
+            decoded.update(zip(new, frames_Bt3HW.unbind(1), strict=True))
+            for t, masks_BKHW in zip(new, masks_BtKHW.unbind(1), strict=True):
+                self._decoded.masks.setdefault(t, masks_BKHW)
+        return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_objects(self, frames: slice | Sequence[int]) -> Tensor:
-        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these times.
+        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames.
 
-        A picture fills the whole frame, also where its slot has no share of the pixels: multiply by the masks to see
-        an object cut out. The sum over the slots of picture times mask is the frame (but for a renderer that
-        overshoots 0..1). These are K times as large as frames and so are not kept.
+        A picture fills the whole frame; multiply it by its mask to cut the object out. Summed over the slots that
+        gives the frame, unless the renderer overshoots 0..1. These pictures are not kept.
 
         Raises:
             IndexError: if there is no such frame.
         """
-        times = self._times(frames)
-        B, _, K, D = self.slots.shape
-        with torch.no_grad():
-            drawn = [
-                (self.renderer(chunk).object_frames_BK3HW.float() * 0.5 + 0.5).clamp(0, 1)
-                for chunk in self.slots[:, times].reshape(-1, K, D).split(max(1, CHUNK // K))
-            ]
-        return torch.cat(drawn).unflatten(0, (B, len(times)))
+
+        def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
+            return (_to_rgb(self.renderer(slots_NKD).object_frames_BK3HW),)
+
+        return self._draw(self._times(frames), draw, at_once=max(1, CHUNK // self.slots.shape[2]))[0]
 
     @property
     def masks(self) -> Tensor:
-        """(B, T, K, H, W) each slot's share of each pixel; sums to 1 over the slots."""
+        """(B, T, K, H, W) each slot's share of each pixel; they sum to 1 over the slots."""
         return self.decode_masks(slice(None))
 
     @property
@@ -119,46 +128,24 @@ class Rollout:
         """(B, T, 3, H, W) RGB 0..1."""
         return self.decode_frames(slice(None))
 
-    def _decode(
-        self, frames: slice | Sequence[int], drawn: dict[int, Tensor], draw: Callable[[list[int]], None]
-    ) -> Tensor:
-        wanted = self._times(frames)
-        missing = [t for t in dict.fromkeys(wanted) if t not in drawn]
-        if missing:
-            draw(missing)
-        return torch.stack([drawn[t] for t in wanted], dim=1)
-
     def _times(self, frames: slice | Sequence[int]) -> list[int]:
         """Frame numbers 0..T-1 of a slice or of numbers that may count from the end."""
         T = self.slots.shape[1]
-        wanted = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
-        if not wanted:
+        times = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
+        if not times:
             raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
-        return wanted
+        return times
 
-    def _draw_masks(self, times: list[int]) -> None:
+    @torch.no_grad()
+    def _draw(
+        self, times: list[int], draw: Callable[[Tensor], tuple[Tensor, ...]], at_once: int = CHUNK
+    ) -> list[Tensor]:
+        """What `draw` makes of these frames' slots (N, K, D): its results, each (B, t, ...)."""
         B, _, K, D = self.slots.shape
-        slots_NKD = self.slots[:, times].reshape(-1, K, D)
-        with torch.no_grad():
-            masks_NKHW = torch.cat([self.renderer.masks(chunk).float() for chunk in slots_NKD.split(CHUNK)])
-        masks_BtKHW = masks_NKHW.view(B, len(times), *masks_NKHW.shape[1:])
-        self._decoded.masks.update({t: masks_BtKHW[:, i] for i, t in enumerate(times)})
+        drawn = [draw(slots_NKD) for slots_NKD in self.slots[:, times].reshape(-1, K, D).split(at_once)]
+        return [torch.cat(part).unflatten(0, (B, len(times))) for part in zip(*drawn, strict=True)]
 
-    def _draw_frames(self, times: list[int]) -> None:
-        B, _, K, D = self.slots.shape
-        slots_NKD = self.slots[:, times].reshape(-1, K, D)
-        with torch.no_grad():
-            drawn = [self.renderer(chunk) for chunk in slots_NKD.split(CHUNK)]
-        # Clamped because a renderer is free to overshoot by a little; 0..1 is this class's promise.
-        frames_N3HW = torch.cat([(d.frames_B3HW.float() * 0.5 + 0.5).clamp(0, 1) for d in drawn])
-        frames_Bt3HW = frames_N3HW.view(B, len(times), *frames_N3HW.shape[1:])
-        masks_NKHW = torch.cat([d.masks_BKHW.float() for d in drawn])
-        masks_BtKHW = masks_NKHW.view(B, len(times), *masks_NKHW.shape[1:])
-        for i, t in enumerate(times):
-            self._decoded.frames[t] = frames_Bt3HW[:, i]
-            self._decoded.masks.setdefault(t, masks_BtKHW[:, i])
-
-    # ---------------------------------------------------------------- where and what the slots are
+    # ---- where and what the slots are
 
     @property
     def positions(self) -> Tensor:
@@ -168,14 +155,9 @@ class Rollout:
         """
         if self.layout.explicit:
             return (self._state.position + 1) / 2 * self._pixels_per_side
-        return self._moments()[0]
-
-    @property
-    def extents(self) -> Tensor:
-        """(B, T, K, 2) standard deviation of the slot's pixels along x and y, in pixels."""
-        if self.layout.explicit:
-            return self._state.scale / 2 * self._pixels_per_side
-        return self._moments()[1]
+        H, W = self.image_size
+        grid_HW2 = (pixel_grid(H, W, device=self.slots.device) + 1) / 2 * self._pixels_per_side
+        return torch.einsum("btkhw,hwc->btkc", self._shares(), grid_HW2)
 
     @property
     def colors(self) -> Tensor:
@@ -205,24 +187,16 @@ class Rollout:
         return self.slots.new_tensor([W, H])
 
     def _shares(self) -> Tensor:
-        """Masks as weights that sum to 1 over the pixels. Only pixels that the slot wins count, if it wins
-        any: a soft mask has a faint tail over the whole picture, which would draw every centre towards the
-        middle."""
+        """Masks as weights that sum to 1 over the pixels."""
+        # A soft mask has a faint tail over the whole picture, which would draw its centre towards the middle.
+        # So only pixels that the slot wins count, if it wins any.
         masks = self.masks
         won = torch.zeros_like(masks).scatter_(2, masks.argmax(dim=2, keepdim=True), 1.0) * masks
-        some = won.flatten(3).sum(dim=-1)[..., None, None] > 0
-        weights = torch.where(some, won, masks)
+        any_won = won.flatten(3).sum(dim=-1)[..., None, None] > 0
+        weights = torch.where(any_won, won, masks)
         return weights / weights.flatten(3).sum(dim=-1)[..., None, None].clamp_min(1e-8)
 
-    def _moments(self) -> tuple[Tensor, Tensor]:
-        H, W = self.image_size
-        grid_HW2 = (pixel_grid(H, W, device=self.slots.device) + 1) / 2 * self._pixels_per_side
-        shares = self._shares()
-        mean = torch.einsum("btkhw,hwc->btkc", shares, grid_HW2)
-        square = torch.einsum("btkhw,hwc->btkc", shares, grid_HW2**2)
-        return mean, (square - mean**2).clamp_min(0).sqrt()
-
-    # ---------------------------------------------------------------- parts of it, and files
+    # ---- parts of it, and files
 
     def select(self, index: int | slice | Sequence[int]) -> Rollout:
         """The rollout of some of the sequences; what has been decoded stays decoded.
@@ -263,27 +237,24 @@ class Rollout:
         )
 
     def save(self, path: str | Path, *, beside: np.ndarray | None = None, fps: int = 6) -> Path:
-        """Draw the rollout into a file: each imagined frame above its masks, one stable colour a slot; in the film
-        of a single sequence, beside its masks.
+        """Draw the rollout into a file: each frame with its masks, in one stable colour for each slot.
 
         Args:
-            path: the suffix decides: `.gif` and `.mp4` play through time, `.png` is a strip from left to
-                right.
-            beside: real frames (T', H, W, 3) uint8 or (B, T', H, W, 3) to show above the imagined ones; if
-                they end earlier than the rollout, the last one stays.
-            fps: frames a second, for `.gif` and `.mp4`.
+            path: `.gif` and `.mp4` play through time, `.png` is a strip from left to right.
+            beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, shown before the imagined ones. If they end
+                earlier than the rollout, the last one stays.
+            fps: frames per second of `.gif` and `.mp4`.
 
         Returns:
-            the path it wrote.
+            The path.
 
         Raises:
             ValueError: if the suffix is another one, or `beside` has another shape.
         """
-        return save_film(
-            Path(path),
-            self.frames.cpu().numpy(),
-            self.masks.cpu().numpy(),
-            self.texts,
-            beside=beside,
-            fps=fps,
-        )
+        frames, masks = self.frames.cpu().numpy(), self.masks.cpu().numpy()
+        return save_film(Path(path), frames, masks, self.texts, beside=beside, fps=fps)
+
+
+def _to_rgb(pictures: Tensor) -> Tensor:
+    """From -1..1 to 0..1, clamped because a renderer may overshoot."""
+    return (pictures.float() * 0.5 + 0.5).clamp(0, 1)

@@ -1,9 +1,8 @@
 """What the numbers of a slot mean.
 
-Everywhere between the rooms a set of slots is one tensor `slots_BKD` (or `slots_BTKD` for a sequence). In the
-published model all D numbers are one unexplained vector. Our shipped model also gives a slot an explicit colour,
-place, size and presence, so that the same tensor can be rolled out by the predictor, drawn by the renderer and
-read by a planner. `SlotLayout` says which of the D numbers are which; nothing else in the code base knows.
+A set of slots is one tensor everywhere, `slots_BKD`, or `slots_BTKD` for a sequence. In the published model the
+D numbers are one learned vector. In the shipped model a slot also states its colour, place, size and presence, which
+the predictor moves, the renderer draws and the planner reads. `SlotLayout` says which of the D numbers are which.
 """
 
 from __future__ import annotations
@@ -15,8 +14,11 @@ from torch import Tensor
 
 from textocvp.layers import full_precision, pixel_grid
 
-PRESENCE_BACKGROUND = 2.0
-"""Value of a slot's presence that marks it as the canvas behind everything (1 is a thing, 0 an unused slot)."""
+# The values of a slot's presence. The background is the canvas behind everything.
+PRESENCE_UNUSED, PRESENCE_THING, PRESENCE_BACKGROUND = 0.0, 1.0, 2.0
+# Values in between count as the nearest of the three.
+MIN_USED = (PRESENCE_UNUSED + PRESENCE_THING) / 2
+MIN_BACKGROUND = (PRESENCE_THING + PRESENCE_BACKGROUND) / 2
 
 MIN_SCALE = 0.012
 """Smallest standard deviation of a slot, in -1..1: about a third of a pixel at 64x64."""
@@ -27,8 +29,8 @@ class SlotLayout:
     """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`.
 
     Attributes:
-        content: number of learned, unexplained channels.
-        explicit: whether the 8 explicit channels follow the content. Without them (the published form) D = content.
+        content: number of learned channels, which have no fixed meaning.
+        explicit: whether the 8 explicit channels follow the content. In the published form they do not: D = content.
     """
 
     content: int
@@ -38,6 +40,12 @@ class SlotLayout:
     def dim(self) -> int:
         """D, the width of one slot."""
         return self.content + (8 if self.explicit else 0)
+
+    def used(self, slots: Tensor) -> Tensor:
+        """Which slots (..., K, D) hold something, (..., K) bool. Without explicit channels all do."""
+        if not self.explicit:
+            return torch.ones(slots.shape[:-1], dtype=torch.bool, device=slots.device)
+        return slots[..., -1] >= MIN_USED
 
 
 @dataclass
@@ -49,7 +57,7 @@ class SlotState:
         color: (..., 3) mean RGB of the slot's pixels, -1..1 as in the model's frames.
         position: (..., 2) centre of mass (x, y), -1..1 from left to right and top to bottom.
         scale: (..., 2) standard deviation of the slot's pixels along x and y, same unit as position, positive.
-        presence: (..., 1) 1 for a slot that holds something, 0 for an unused one.
+        presence: (..., 1) `PRESENCE_UNUSED`, `PRESENCE_THING` or `PRESENCE_BACKGROUND`.
     """
 
     content: Tensor
@@ -61,17 +69,17 @@ class SlotState:
     @property
     def is_unused(self) -> Tensor:
         """(..., 1) bool: holds nothing."""
-        return self.presence < 0.5
+        return self.presence < MIN_USED
 
     @property
     def is_thing(self) -> Tensor:
-        """(..., 1) bool: neither unused nor the canvas."""
-        return (self.presence >= 0.5) & (self.presence < 1.5)
+        """(..., 1) bool: neither unused nor the background."""
+        return (self.presence >= MIN_USED) & (self.presence < MIN_BACKGROUND)
 
     @property
     def is_background(self) -> Tensor:
         """(..., 1) bool: the canvas behind everything."""
-        return self.presence >= 1.5
+        return self.presence >= MIN_BACKGROUND
 
     def join(self) -> Tensor:
         """The slot tensor (..., C + 8)."""
@@ -97,7 +105,7 @@ class SlotState:
 def moments(masks: Tensor) -> tuple[Tensor, Tensor]:
     """Centre of mass and standard deviation, each (B, K, 2) as (x, y) in -1..1, of masks (B, K, H, W)."""
     grid_N2 = pixel_grid(masks.shape[-2], masks.shape[-1], device=masks.device).flatten(0, 1)
-    # The difference of squares of a small thing far from the centre is lost in 8 bits.
+    # bfloat16 would lose the difference of squares of a small thing far from the centre.
     with full_precision(masks.device):
         masks = masks.float()
         weights_BKN = masks.flatten(2) / masks.sum((2, 3))[..., None].clamp_min(1e-6)

@@ -1,5 +1,4 @@
-"""The world model as users meet it: load a checkpoint, give it an observation and a sentence, get a
-`Rollout`."""
+"""The world model as users meet it: from an observation and a sentence to a `Rollout`."""
 
 from __future__ import annotations
 
@@ -56,14 +55,10 @@ class WorldModel:
         config = self.model.config
         million = sum(p.numel() for p in self.model.parameters()) / 1e6
         H, W = self.image_size
-        ahead = (
-            f"up to {self.longest_horizon} frames ahead"
-            if self.longest_horizon
-            else "any number of frames ahead"
-        )
+        ahead = f"up to {self.longest_horizon}" if self.longest_horizon else "any number of"
         return (
             f"WorldModel({self.checkpoint.name!r}, {million:.1f} M parameters, {H}x{W} frames, "
-            f"{config.parser.num_slots} slots, {ahead}, on {self.model.device})"
+            f"{config.parser.num_slots} slots, {ahead} frames ahead, on {self.model.device})"
         )
 
     @property
@@ -74,10 +69,9 @@ class WorldModel:
 
     @property
     def longest_horizon(self) -> int | None:
-        """How many frames it can imagine at once; None for as many as you like (the published moving
-        window)."""
+        """How many frames it can imagine at once; None for any number (the published moving window)."""
         predictor = self.model.config.predictor
-        return predictor.window if predictor.attention == "causal" else None
+        return predictor.window if predictor.causal else None
 
     @torch.no_grad()
     def rollout(
@@ -89,39 +83,36 @@ class WorldModel:
         seed: int = 0,
         num_slots: int | None = None,
         attention: bool = False,
-        use_cache: bool = True,
     ) -> Rollout:
         """Imagine the next `horizon` frames.
 
-        One scene and n texts give n sequences over one parsed scene; n scenes and n texts go together
-        pairwise; n scenes and one text all get that text.
+        One scene and n texts give n sequences, and the scene is parsed once. n scenes and n texts go together
+        pairwise. n scenes and one text all get that text.
 
         Args:
-            obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3)
-                or images (B, H, W, 3), uint8; or a rollout, to go on from its last slots.
+            obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images
+                (B, H, W, 3), uint8. Or a rollout, to go on from its last slots.
             text: what is to be done.
             horizon: how many frames to imagine after the one that is seen.
             seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
-            num_slots: how many slots to look for in an image, background included: more than the model was
-                trained with for scenes of more things. The configured number by default.
-            attention: also keep the weights from slots to words.
-            use_cache: reuse the keys and values of past frames; without it they are computed again at every
-                step (slower, the same up to rounding; for checks).
+            num_slots: how many slots to look for in an image, background included. The configured number by default;
+                more for scenes of more things than the model was trained with.
+            attention: also keep the attention from slots to words.
 
         Returns:
-            a rollout of `horizon + 1` frames, the first of which is the parsed observation.
+            A rollout of `horizon + 1` frames, the first of which is the parsed observation.
 
         Raises:
-            TypeError: if the observation is not uint8 or none of the above.
-            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says
-                what is.
+            TypeError: if the observation is none of the above or not uint8, or a text is no string.
+            ValueError: if a shape, value or size, the horizon or a text is not allowed; the message says what is.
 
-        A word that the text encoder has never met is a `UserWarning` that names the word.
+        Warns:
+            UserWarning: if the text encoder does not know a word, which is named, or if the predictor is untrained.
         """
         if self.model.config.stage == "parser":
             warnings.warn(
-                f"{self.checkpoint.name} has been through the first stage of training only: it can parse, and "
-                "what it imagines is noise",
+                f"{self.checkpoint.name} has been through the first stage of training only: it can parse, but what it "
+                "imagines is noise",
                 UserWarning,
                 stacklevel=2,
             )
@@ -129,13 +120,11 @@ class WorldModel:
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
         checked_horizon(horizon, self.longest_horizon, hint)
         slots_BKD = self._first_slots(obs, seed, num_slots)
-        sentences = len(texts)
-        B = checked_pairs(slots_BKD.shape[0], sentences)
-        texts = texts * B if sentences == 1 else texts
+        B = checked_pairs(len(slots_BKD), len(texts))
+        texts = texts * B if len(texts) == 1 else texts
         seed_B1KD = slots_BKD.expand(B, -1, -1)[:, None]
-        imagined = self.model.predictor.rollout(
-            seed_B1KD, self.model.text(texts), horizon, use_cache=use_cache, return_attention=attention
-        )
+        tokens = self.model.text(texts)
+        imagined = self.model.predictor.rollout(seed_B1KD, tokens, horizon, return_attention=attention)
         slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
         return self._as_rollout(slots_BTKD, tuple(texts), imagined.attention_BSnhKL)
 
@@ -153,7 +142,7 @@ class WorldModel:
 
     @torch.no_grad()
     def parse(self, video: np.ndarray, *, seed: int = 0, num_slots: int | None = None) -> Rollout:
-        """Slots of true frames, nothing imagined: what a perfect prediction would be measured at.
+        """The slots of true frames: what a perfect prediction would be.
 
         Args:
             video: (T, H, W, 3) or (B, T, H, W, 3) uint8.
@@ -164,19 +153,16 @@ class WorldModel:
             TypeError, ValueError: as `rollout`.
         """
         frames = np.asarray(video)
-        if frames.ndim == 4:
-            frames = frames[None]
-        if frames.ndim != 5:
-            raise ValueError(f"video must be (T, H, W, 3) or (B, T, H, W, 3), not {np.asarray(video).shape}")
-        B, T = frames.shape[:2]
-        flat_N3HW = checked_frames(
-            frames.reshape(-1, *frames.shape[2:]), self.image_size, self.model.device, "video"
-        )
-        parsed = self._parsed(flat_N3HW.unflatten(0, (B, T)), seed, num_slots)
+        if frames.ndim not in (4, 5):
+            raise ValueError(f"video must be (T, H, W, 3) or (B, T, H, W, 3), not {frames.shape}")
+        B, T = frames.shape[:-3] if frames.ndim == 5 else (1, len(frames))
+        images = frames.reshape(-1, *frames.shape[-3:])
+        frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video")
+        parsed = self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
     def words(self, text: str) -> list[str]:
-        """A sentence as the text encoder sees it, one word for each weight that `Rollout.attention` gives it.
+        """A sentence as the text encoder splits it: what the last axis of `Rollout.attention` stands for.
 
         Raises:
             TypeError: if the text is not a string.
@@ -197,8 +183,7 @@ class WorldModel:
         if isinstance(obs, Rollout):
             if num_slots is not None and num_slots != obs.slots.shape[2]:
                 raise ValueError(
-                    f"this rollout goes on with its own {obs.slots.shape[2]} slots; num_slots = {num_slots} is "
-                    "for images"
+                    f"this rollout goes on with its own {obs.slots.shape[2]} slots; num_slots={num_slots} is for images"
                 )
             if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
                 raise ValueError(

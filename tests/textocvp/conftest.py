@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from textocvp.config import ModelConfig, PredictorConfig
+from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
 from textocvp.parsers.holistic import HolisticConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.parsers.savi import SaviConfig
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers.broadcast import BroadcastConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.upsample import UpsampleConfig
@@ -27,7 +28,7 @@ PLACED = ModelConfig(
     parser=PlacedConfig(image_size=32, num_slots=5, layout=SlotLayout(content=8), hidden=16, crop_cells=8),
     renderer=GlimpseConfig(hidden=16, crop_cells=8),
     text=SMALL_TEXT,
-    predictor=PredictorConfig(
+    predictor=TextOCVPConfig(
         dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, color_bias=True, feed_forwards=1
     ),
 )
@@ -46,7 +47,7 @@ PUBLISHED = ModelConfig(
     ),
     renderer=BroadcastConfig(channels=8),
     text=replace(SMALL_TEXT, kind="transformer", vocabulary=GRAMMAR + TRAIN_COLORS),
-    predictor=PredictorConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
+    predictor=TextOCVPConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
 )
 
 NON_OC = ModelConfig(
@@ -56,7 +57,7 @@ NON_OC = ModelConfig(
     ),
     renderer=UpsampleConfig(channels=8),
     text=SMALL_TEXT,
-    predictor=PredictorConfig(
+    predictor=TextOCVPConfig(
         dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, standardize=True
     ),
 )

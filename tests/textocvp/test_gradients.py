@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
-from textocvp.config import ModelConfig
+from textocvp.config import ModelConfig, with_settings
 from textocvp.training.predictor import PredictorStage, PredictorTraining, assemble
-
-
-def variant(config: ModelConfig, **changes: object) -> ModelConfig:
-    return replace(config, predictor=replace(config.predictor, **changes))
 
 
 @pytest.mark.parametrize(
@@ -23,8 +18,8 @@ def variant(config: ModelConfig, **changes: object) -> ModelConfig:
         PLACED,
         PUBLISHED,
         NON_OC,
-        variant(PLACED, kind="ocvp-seq", color_bias=False),
-        variant(PUBLISHED, kind="ocvp-seq"),
+        with_settings(PLACED, ["predictor.kind=ocvp-seq"]),
+        with_settings(PUBLISHED, ["predictor.kind=ocvp-seq"]),
     ],
     ids=lambda config: f"{config.name}-{config.predictor.kind}",
 )
@@ -46,4 +41,4 @@ def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: P
     assert touched(model.parser) == touched(model.renderer) == []
     parts = {name.split(".")[0] for name in touched(model.predictor)}
     assert parts == {"slot_in", "layers", "slot_out", "ages"}
-    assert bool(touched(model.text)) == model.predictor.hears_text
+    assert bool(touched(model.text)) == model.predictor.uses_text

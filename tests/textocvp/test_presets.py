@@ -33,7 +33,7 @@ def test_counts_are_those_of_the_real_models() -> None:
     for name in [name for name in PRESETS if name.endswith("-small")]:
         model = TextOCVP(PRESETS[name])
         parts = [model.parser, model.predictor, model.renderer]
-        if model.predictor.hears_text:  # else nothing trains it
+        if model.predictor.uses_text:  # else nothing trains it
             parts.append(model.text)
         whole = sum(p.numel() for part in parts for p in part.parameters() if p.requires_grad)
         predictor = sum(p.numel() for p in model.predictor.parameters())

@@ -11,11 +11,12 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import ModelConfig, PredictorConfig
+from textocvp.config import ModelConfig
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatches
 from textocvp.data.slot_cache import SlotCache
 from textocvp.model import TextOCVP
+from textocvp.predictors.ocvp_seq import OCVPSeqConfig
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
 from textocvp.text.words import WordsConfig
@@ -36,9 +37,7 @@ LAYOUT = SlotLayout(content=4)
 OCVP_SEQ = replace(
     PLACED,
     name="tiny-ocvp-seq",
-    predictor=PredictorConfig(
-        kind="ocvp-seq", dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8
-    ),
+    predictor=OCVPSeqConfig(dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8),
 )
 
 

@@ -1,14 +1,15 @@
-"""From the slots of some frames and a text to the slots of the next: one file a predictor, and the table."""
+"""Predictors: from the slots of some frames and a text to the slots of the next frames. One file each."""
 
 from __future__ import annotations
 
-from textocvp.config import PredictorConfig
-from textocvp.predictors.base import Imagined, SlotPredictor
-from textocvp.predictors.ocvp_seq import OcvpSeq
-from textocvp.predictors.textocvp import Predictor
+from textocvp.predictors.base import Imagined, PredictorConfig, SlotPredictor
+from textocvp.predictors.ocvp_seq import OCVPSeqPredictor
+from textocvp.predictors.textocvp import TextOCVPPredictor
 from textocvp.slots import SlotLayout
 
-__all__ = ["Imagined", "Predictor", "SlotPredictor", "build_predictor"]
+__all__ = ["PREDICTORS", "Imagined", "PredictorConfig", "SlotPredictor", "build_predictor"]
+
+PREDICTORS: dict[str, type[SlotPredictor]] = {"textocvp": TextOCVPPredictor, "ocvp-seq": OCVPSeqPredictor}
 
 
 def build_predictor(config: PredictorConfig, layout: SlotLayout, text_dim: int) -> SlotPredictor:
@@ -16,14 +17,12 @@ def build_predictor(config: PredictorConfig, layout: SlotLayout, text_dim: int) 
 
     Args:
         config: its kind and sizes.
-        layout: what the numbers of one slot mean.
+        layout: what the numbers of a slot mean.
         text_dim: width of the text tokens.
 
     Raises:
-        ValueError: if there is no such kind, or it does not fit the layout.
+        ValueError: if there is no such kind, or the options do not fit each other or the layout.
     """
-    if config.kind == "textocvp":
-        return Predictor(config, layout, text_dim)
-    if config.kind == "ocvp-seq":
-        return OcvpSeq(config, layout)
-    raise ValueError(f"unknown predictor.kind {config.kind!r}; known: textocvp, ocvp-seq")
+    if config.kind not in PREDICTORS:
+        raise ValueError(f"unknown predictor.kind {config.kind!r}; known: {', '.join(PREDICTORS)}")
+    return PREDICTORS[config.kind](config, layout, text_dim)

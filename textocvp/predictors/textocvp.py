@@ -1,116 +1,98 @@
-"""From the slots of some frames and a text to the slots of the next: the language-conditioned transformer.
+"""The published predictor, a transformer conditioned on the text (TextOCVP, TMLR 2026, section 3.2).
 
-The published predictor (TextOCVP, TMLR 2026, section 3.2), and `build_predictor`, the one place that picks a kind.
+In every layer all slots of all frames attend to each other, then to the words.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.config import PredictorConfig
-from textocvp.layers import MASKED, FeedForward, KeyValueCache, SelfAttention, TextAttention
-from textocvp.predictors.base import Caches, Memory, SlotPredictor, mask_bias
+from textocvp.layers import MASKED, KeyValueCache, SelfAttention, TextAttention, mask_bias
+from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor, feed_forward
 from textocvp.slots import SlotLayout, SlotState
-from textocvp.text.base import TextTokens
+
+if TYPE_CHECKING:
+    from textocvp.text.base import TextTokens
 
 
-@dataclass
-class _TextMemory(Memory):
-    """Keys and values of the words for each layer, and logit terms."""
+@dataclass(frozen=True)
+class TextOCVPConfig(PredictorConfig):
+    """Options of the published predictor.
+
+    Attributes:
+        color_bias: add `color_match` to the logits of the attention to the words. Needs explicit slots and a text
+            encoder whose words carry RGB. The published model does not do this.
+    """
+
+    kind: Literal["textocvp"] = "textocvp"
+    color_bias: bool = False
+
+
+class TextContext(NamedTuple):
+    """What a rollout needs of the text: keys and values of the words for each layer, logit terms, colour match."""
 
     keys_values: list[tuple[Tensor, Tensor]]
-    mask_bias_B11L: Tensor
+    bias_B11L: Tensor
     match_BKL: Tensor | None
 
 
-class Predictor(SlotPredictor):
-    """All slots of all frames attend to each other and to the words, layer by layer.
+class TextOCVPPredictor(SlotPredictor):
+    """Attention among all slots of all frames and from slots to words."""
 
-    Args:
-        config: sizes and form.
-        layout: what the numbers of a slot mean.
-        text_dim: width of the text tokens.
+    Config = TextOCVPConfig
+    uses_text = True
+    config: TextOCVPConfig
 
-    Raises:
-        ValueError: if `color_bias` is asked for without explicit slot colours.
-    """
-
-    hears_text = True
-
-    def __init__(self, config: PredictorConfig, layout: SlotLayout, text_dim: int) -> None:
+    def __init__(self, config: TextOCVPConfig, layout: SlotLayout, text_dim: int) -> None:
         if config.color_bias and not layout.explicit:
             raise ValueError("color_bias needs slots with explicit colour (layout.explicit)")
-        super().__init__(config, layout, (PredictorLayer(config, text_dim) for _ in range(config.layers)))
+        super().__init__(config, layout, text_dim)
 
-    def _remember(self, text: TextTokens, slots_BKD: Tensor, caches: Caches | None) -> _TextMemory:
-        keys_values = [layer.remember(text.embeddings_BLC) for layer in self.layers]  # type: ignore[operator]
+    def _layer(self, text_dim: int) -> nn.Module:
+        return TextOCVPLayer(self.config, text_dim)
+
+    def _text_context(self, text: TextTokens, slots_BKD: Tensor) -> TextContext:
         match_BKL = None
         if self.config.color_bias:
-            color_BKD = SlotState.split(slots_BKD, self.layout).color
-            match_BKL = color_match(color_BKD, self._present(slots_BKD), text)
-        return _TextMemory(caches, keys_values, mask_bias(~text.mask_BL)[:, None, None], match_BKL)
+            color_BK3 = SlotState.split(slots_BKD, self.layout).color
+            match_BKL = color_match(color_BK3, self.layout.used(slots_BKD), text)
+        keys_values = [layer.text_attention.keys_values(text.embeddings_BLC) for layer in self.layers]  # type: ignore
+        return TextContext(keys_values, mask_bias(~text.mask_BL)[:, None, None], match_BKL)
 
-    def _transform(
-        self,
-        x_BTKC: Tensor,
-        absent_BMK: Tensor,
-        frame_bias: Tensor | None,
-        memory: Memory,
-        *,
-        newest_only: bool,
-    ) -> tuple[Tensor, Tensor]:
-        assert isinstance(memory, _TextMemory)
-        frames, slots = x_BTKC.shape[1:3]
-        x_BNC = x_BTKC.flatten(1, 2)
-        bias = mask_bias(absent_BMK.flatten(1))[:, None, None]
-        if frame_bias is not None:
-            bias = bias + frame_bias.repeat_interleave(slots, 1).repeat_interleave(slots, 2)[:, None]
+    def _transform(self, x_BTKC: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor]:
+        T, K = x_BTKC.shape[1:3]
+        text: TextContext = state.text
+        x_BNC = x_BTKC.flatten(1, 2)  # N = T * K tokens attend to M * K
+        masked_BTMK = self._masked(state.unused_BMK, T)
+        bias = mask_bias(masked_BTMK.flatten(2)).repeat_interleave(K, 1)[:, None]  # (B, 1, N, M * K)
         maps = []
         for index, layer in enumerate(self.layers):
-            cut = newest_only and frames > 1 and index == len(self.layers) - 1
-            if cut:  # nobody asks the last layer for older frames
-                bias, frames = bias[..., -slots:, :], 1
-            match_BNL = None if memory.match_BKL is None else memory.match_BKL.repeat(1, frames, 1)
-            x_BNC, map_BhNL = layer(
-                x_BNC,
-                bias,
-                memory.keys_values[index],
-                memory.mask_bias_B11L,
-                match_BNL,
-                newest=slots if cut else None,
-                cache=None if memory.caches is None else memory.caches.layers[index],
-            )
-            maps.append(map_BhNL[:, :, -slots:])
-        return x_BNC.unflatten(1, (frames, slots)), torch.stack(maps, dim=1)
+            newest = None
+            if newest_only and T > 1 and index == len(self.layers) - 1:
+                newest, T, bias = K, 1, bias[..., -K:, :]  # nobody needs older frames after the last layer
+            match_BNL = None if text.match_BKL is None else text.match_BKL.repeat(1, T, 1)
+            words = (text.keys_values[index], text.bias_B11L, match_BNL)
+            x_BNC, map_BhNL = layer(x_BNC, bias, *words, newest, state.caches[index])
+            maps.append(map_BhNL[:, :, -K:])
+        return x_BNC.unflatten(1, (T, K)), torch.stack(maps, dim=1)
 
 
-class PredictorLayer(nn.Module):
-    """Self-attention, text-to-slot cross-attention and one or two feed-forward nets, all pre-norm and
-    residual.
+class TextOCVPLayer(nn.Module):
+    """Self-attention, attention from slots to words, and feed-forward nets; all pre-norm and residual."""
 
-    The authors' code has two feed-forward nets a layer, the paper's text one.
-    """
-
-    def __init__(self, config: PredictorConfig, text_dim: int) -> None:
+    def __init__(self, config: TextOCVPConfig, text_dim: int) -> None:
         super().__init__()
         self.norm_self = nn.LayerNorm(config.dim, eps=1e-6)
         self.self_attention = SelfAttention(config.dim, config.heads)
         self.norm_text = nn.LayerNorm(config.dim, eps=1e-6)
         self.text_attention = TextAttention(config.dim, config.heads, text_dim)
-        self.feed_forwards = nn.ModuleList(
-            nn.Sequential(nn.LayerNorm(config.dim, eps=1e-6), FeedForward(config.dim, config.hidden))
-            for _ in range(config.feed_forwards)
-        )
-        # How much a slot of the wrong colour loses of a colour word's attention, per unit of squared RGB
-        # distance.
+        self.feed_forwards = nn.ModuleList(feed_forward(config) for _ in range(config.feed_forwards))
+        # How much a slot of the wrong colour loses of a word's attention, per unit of squared RGB distance.
         self.color_gain_h = nn.Parameter(torch.full((config.heads,), 4.0)) if config.color_bias else None
-
-    def remember(self, text_BLC: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and values of the words, (B, h, L, d) each, for `forward`."""
-        return self.text_attention.keys_values(text_BLC)
 
     def forward(
         self,
@@ -119,32 +101,29 @@ class PredictorLayer(nn.Module):
         keys_values: tuple[Tensor, Tensor],
         text_bias: Tensor,
         match_BNL: Tensor | None,
-        *,
-        newest: int | None = None,
-        cache: KeyValueCache | None = None,
+        newest: int | None,
+        cache: KeyValueCache | None,
     ) -> tuple[Tensor, Tensor]:
-        """The `newest` last tokens (default: all) after the layer, and how they attended to the text."""
-        attended_BNC = self.self_attention(self.norm_self(x_BMC), self_bias, newest=newest, cache=cache)
+        """The last `newest` tokens (default: all) after the layer, and their attention to the words (B, h, N, L)."""
+        attended_BNC = self.self_attention(self.norm_self(x_BMC), self_bias, newest, cache)
         x_BNC = attended_BNC + (x_BMC if newest is None else x_BMC[:, -newest:])
         if match_BNL is not None and self.color_gain_h is not None:
             text_bias = text_bias + self.color_gain_h[:, None, None] * match_BNL[:, None]
-        told_BNC, weights_BhNL = self.text_attention(self.norm_text(x_BNC), keys_values, text_bias)
-        x_BNC = x_BNC + told_BNC
-        for feed_forward in self.feed_forwards:
-            x_BNC = x_BNC + feed_forward(x_BNC)
-        return x_BNC, weights_BhNL
+        text_update_BNC, map_BhNL = self.text_attention(self.norm_text(x_BNC), keys_values, text_bias)
+        x_BNC = x_BNC + text_update_BNC
+        for update in self.feed_forwards:
+            x_BNC = x_BNC + update(x_BNC)
+        return x_BNC, map_BhNL
 
 
-def color_match(color_BK3: Tensor, present_BK: Tensor, text: TextTokens) -> Tensor:
-    """How well each slot's colour fits each word: minus the squared RGB distance, the best present slot of a
-    word at 0.
+def color_match(color_BK3: Tensor, used_BK: Tensor, text: TextTokens) -> Tensor:
+    """How well each slot's colour fits each word: minus the squared RGB distance, relative to the best used slot.
 
-    0 everywhere for words that name no colour. The shift makes it a comparison between the things of the
-    scene, so a lexicon's idea of a colour need not be the camera's.
+    So the slots of a scene are compared with each other, and a lexicon's idea of a colour need not be the camera's.
 
     Returns:
-        (B, K, L), at most 0 for present slots.
+        (B, K, L): 0 for the best used slot and for words that name no colour, below 0 otherwise.
     """
     match_BKL = -(color_BK3[:, :, None] - text.colors_BL3[:, None]).square().sum(dim=-1)
-    best_B1L = match_BKL.masked_fill(~present_BK[..., None], MASKED).amax(dim=1, keepdim=True)
+    best_B1L = match_BKL.masked_fill(~used_BK[..., None], MASKED).amax(dim=1, keepdim=True)
     return ((match_BKL - best_B1L) * text.names_color_BL[:, None]).clamp(max=0.0)

@@ -28,4 +28,4 @@ def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) 
         layout: what the numbers of one slot mean.
         image_size: side of the square frames it draws, in pixels.
     """
-    return RENDERERS[config.kind](config, layout, image_size)
+    return RENDERERS[config.kind](config, layout, image_size)  # type: ignore[call-arg, arg-type]

@@ -9,8 +9,6 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from textocvp.slots import SlotLayout
-
 
 @dataclass(frozen=True)
 class RendererConfig:
@@ -52,20 +50,14 @@ class Rendered:
 class Renderer(nn.Module):
     """Slots to pixels. Subclasses set `Config` and write `forward` and, where colours cost much, a cheaper `masks`.
 
+    They are built from (config, layout, image_size): their sizes, what the numbers of one slot mean, and the side of
+    the square frames in pixels.
+
     Attributes:
         Config: the class of its configuration.
-
-    Args:
-        config: its sizes.
-        layout: what the numbers of one slot mean.
-        image_size: side of the square frames in pixels.
     """
 
     Config: ClassVar[type[RendererConfig]]
-
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        self.layout, self.image_size = layout, image_size
 
     @abstractmethod
     def forward(self, slots_BKD: Tensor) -> Rendered:

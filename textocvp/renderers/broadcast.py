@@ -34,7 +34,8 @@ class BroadcastRenderer(Renderer):
     Config = BroadcastConfig
 
     def __init__(self, config: BroadcastConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__(config, layout, image_size)
+        super().__init__()
+        self.image_size = image_size
         slot_dim, channels = layout.dim, config.channels
         self.position = PositionCode(slot_dim)
         self.convolutions = nn.Sequential(

@@ -45,7 +45,8 @@ class GlimpseRenderer(Renderer):
     Config = GlimpseConfig
 
     def __init__(self, config: GlimpseConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__(config, layout, image_size)
+        super().__init__()
+        self.layout, self.image_size = layout, image_size
         self.cells, self.extent = config.crop_cells, config.crop_extent
         self.decoder = nn.Sequential(
             nn.Linear(layout.content, config.hidden),

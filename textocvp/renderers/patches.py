@@ -152,8 +152,8 @@ class GridRenderer(Renderer):
     """
 
     def __init__(self, config: GridConfig, layout: SlotLayout, image_size: int, out_dim: int) -> None:
-        super().__init__(config, layout, image_size)
-        self.cells = config.patches
+        super().__init__()
+        self.cells, self.image_size = config.patches, image_size
         self.decoder = PatchDecoder(layout.dim, self.cells, config.layers, config.hidden, out_dim)
         self.place = SlotPlace(layout.dim) if config.mask_prior else None
 

@@ -33,7 +33,8 @@ class UpsampleRenderer(Renderer):
     Config = UpsampleConfig
 
     def __init__(self, config: UpsampleConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__(config, layout, image_size)
+        super().__init__()
+        self.image_size = image_size
         count = (image_size // CELLS).bit_length() - 1  # of doublings
         wide = 2 * config.channels
         self.cells = nn.Sequential(

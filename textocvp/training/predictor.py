@@ -25,12 +25,13 @@ from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from textocvp.config import ModelConfig, PredictorConfig, with_settings
+from textocvp.config import ModelConfig, with_settings
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatch, SlotBatches, true_frames
 from textocvp.data.slot_cache import SlotCache, cached_slots, parse_share
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
+from textocvp.predictors import PredictorConfig
 from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import TextEncoder, WordBatch
@@ -100,27 +101,25 @@ class PredictorStage(nn.Module):
         super().__init__()
         self.text: TextEncoder = model.text
         self.predictor: SlotPredictor = model.predictor
-        if not self.predictor.hears_text:  # several processes would wait for gradients that never come
+        if not self.predictor.uses_text:  # several processes would wait for gradients that never come
             self.text.requires_grad_(False)
 
-    def forward(
-        self, seen_BTKD: Tensor, words: WordBatch, imagined: int, forgetful_B: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, seen_BTKD: Tensor, words: WordBatch, imagined: int) -> Tensor:
         """Predictions (B, S, K, D), the last of which is of the frame number T + imagined (the first is
         number 0).
 
         The `causal` form predicts from every true and every imagined frame the next, S = T + imagined. The
         `window` form only predicts new frames, S = imagined + 1."""
         text = self.text.encode(words)
-        if self.predictor.config.attention == "window":
+        if not self.predictor.config.causal:
             return self.predictor.rollout(seen_BTKD, text, imagined + 1).slots_BSKD
         if imagined:
             with torch.no_grad():
-                dreamt_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
+                imagined_BSKD = self.predictor.rollout(seen_BTKD, text, imagined).slots_BSKD
             # Under autocast some versions of torch would reuse weights that were cast without a gradient.
             torch.clear_autocast_cache()
-            seen_BTKD = torch.cat([seen_BTKD, dreamt_BSKD], dim=1)
-        return self.predictor(seen_BTKD, text, forgetful_B)
+            seen_BTKD = torch.cat([seen_BTKD, imagined_BSKD], dim=1)
+        return self.predictor(seen_BTKD, text)
 
 
 def train(args: PredictorTraining) -> InstructionFollowing | None:
@@ -212,7 +211,7 @@ def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
 def training_frames(config: ModelConfig, cache: SlotCache) -> int:
     """Frames of a training sequence: one more than the past, so that every time code gets trained."""
     longest = int(cache.lengths.max())
-    if config.predictor.attention == "causal":
+    if config.predictor.causal:
         return config.predictor.window + 1
     return longest
 
@@ -246,7 +245,7 @@ def fit(
         mine = exercise(args, model.config.predictor, batches, step).select(run.rows).to(run.device)
         for part in run.parts():
             task = mine.select(part)
-            asked = (task.seen_BTKD, task.batch.words, task.lesson.imagined, task.forgetful_B)
+            asked = (task.seen_BTKD, task.batch.words, task.lesson.imagined)
             predicted_BSKD = run.module(*asked).float()
             loss = slot_loss(predicted_BSKD, task.true_BSKD, task.weights_BSK, layout, std_C, whole=1.0)
             total = loss.total(args.scale_weight, args.content_weight)
@@ -298,13 +297,13 @@ def next_lesson(
     args: PredictorTraining, predictor: PredictorConfig, step: int, frames: int, rng: np.random.Generator
 ) -> Lesson:
     """The lesson of update number `step`, for episodes of `frames` frames."""
-    begin = round(args.steps * (1 - args.autoregressive)) if predictor.attention == "causal" else 0
+    begin = round(args.steps * (1 - args.autoregressive)) if predictor.causal else 0
     if step < begin:
         return Lesson(frames - 1, 0)
     grown = min(1.0, (step - begin) / max(1.0, 0.8 * (args.steps - begin)))
     longest = min(frames - 1, args.horizon + round(grown * (frames - 1 - args.horizon)))
     horizon = int(rng.integers((longest + 1) // 2, longest + 1))
-    if predictor.attention == "causal":
+    if predictor.causal:
         return Lesson(frames - horizon, horizon - 1)
     return Lesson(int(rng.integers(1, frames - horizon + 1)), horizon - 1)
 
@@ -367,7 +366,7 @@ def exercise(
     forgetful_B = torch.from_numpy(rng.random(args.batch) < args.forgetful)
     last = lesson.seen + lesson.imagined  # the number of the last frame that is predicted
     # The causal form predicts from every frame the next, the window form only new frames.
-    predictions = last if predictor.attention == "causal" else lesson.imagined + 1
+    predictions = last if predictor.causal else lesson.imagined + 1
     drawn_BF = rng.integers(predictions, size=(args.batch, args.image_frames))
     first = last + 1 - predictions
     true_BTKD = batch.slots_BTKD[:, first - 1 : last + 1]
@@ -392,7 +391,7 @@ def with_longer_window(predictor: SlotPredictor, window: int) -> SlotPredictor:
         )
     grown = copy.deepcopy(predictor)
     grown.config = replace(config, window=window)
-    rows = window + (config.attention == "window")
+    rows = grown.config.time_codes
     if config.age_encoding == "learned":
         # The published form has one code more than its window has frames: no training ever reached that one.
         reached = predictor.ages.detach()[: config.window]

@@ -19,13 +19,14 @@ from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import ModelConfig, PredictorConfig, with_settings
+from textocvp.config import ModelConfig, with_settings
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.feature_cache import FeatureCacheError
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.parsers.savi import SaviConfig, SaviParser
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.presets import PRESETS, preset
 from textocvp.pretrained import WeightsError
 from textocvp.renderers.patches import FeatureConfig
@@ -53,7 +54,7 @@ TINY = ModelConfig(
     ),
     renderer=FeatureConfig(patches=8, layers=3, hidden=16, feature_dim=DIM, image_channels=32),
     text=SMALL_TEXT,
-    predictor=PredictorConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
+    predictor=TextOCVPConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
 )
 ORDER = torch.tensor([2, 0, 3, 1])
 

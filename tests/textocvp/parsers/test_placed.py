@@ -7,7 +7,7 @@ import torch
 
 from textocvp.parsers import build_parser
 from textocvp.parsers.placed import PlacedConfig, PlacedParser
-from textocvp.slots import SlotLayout, SlotState, moments
+from textocvp.slots import SlotLayout, SlotState
 
 CONFIG = PlacedConfig(num_slots=6, layout=SlotLayout(content=16), hidden=32)
 RED, BLUE, DARK = (255, 87, 89), (78, 121, 167), (47, 47, 47)
@@ -83,22 +83,6 @@ def test_slot_number_can_be_raised_at_test_time() -> None:
         few, many = (parser()(clip(), num_slots=k).slots_BTKD for k in (4, 9))
     assert many.shape[2] == 9
     torch.testing.assert_close(many[:, :, :4], few, atol=1e-5, rtol=1e-5)
-
-
-def test_moments_of_a_box() -> None:
-    mask = torch.zeros(1, 1, 64, 64)
-    mask[..., 8:24, 32:40] = 1
-    position, scale = moments(mask)
-    torch.testing.assert_close(position[0, 0], torch.tensor([36 / 32 - 1, 16 / 32 - 1]))
-    torch.testing.assert_close(scale[0, 0] * 32, torch.tensor([(63 / 12) ** 0.5, (255 / 12) ** 0.5]))
-
-
-def test_moments_are_as_precise_under_autocast() -> None:
-    mask = torch.zeros(1, 1, 64, 64)
-    mask[..., 52:58, 50:56] = 1
-    with torch.autocast("cpu", torch.bfloat16):
-        position, scale = moments(mask.bfloat16())
-    torch.testing.assert_close((position, scale), moments(mask))
 
 
 def test_configurations_that_do_not_fit_are_refused() -> None:

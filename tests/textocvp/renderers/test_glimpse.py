@@ -1,4 +1,4 @@
-"""Reading and drawing in a slot's own coordinates."""
+"""Drawing slots at their own place and size."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from textocvp.config import with_settings
-from textocvp.crop import crop, paste
 from textocvp.model import TextOCVP
 from textocvp.presets import preset
 from textocvp.renderers.glimpse import GlimpseConfig, GlimpseRenderer
@@ -35,27 +34,6 @@ def slots(generator: torch.Generator, batch: int = 2, things: int = 3, unused: i
 def renderer() -> GlimpseRenderer:
     torch.manual_seed(0)
     return GlimpseRenderer(GlimpseConfig(hidden=32, crop_cells=16), LAYOUT, image_size=64)
-
-
-def test_what_is_read_is_drawn_back_where_it_was() -> None:
-    image = torch.zeros(1, 1, 1, 64, 64)
-    image[..., 20:32, 36:46] = 1
-    center = torch.tensor([[[(41 / 64) * 2 - 1, (26 / 64) * 2 - 1]]])
-    scale = torch.tensor(
-        [[[10 / 64 / 3**0.5, 12 / 64 / 3**0.5]]]
-    )  # deviation of a uniform box: side / sqrt(12)
-    back = paste(crop(image, center, scale, 24, 2.6), center, scale, 64, 64, 2.6)
-    assert (back - image).abs().mean() < 0.01
-    assert torch.equal((back > 0.5).float(), image)
-
-
-def test_moving_the_slot_by_whole_pixels_moves_the_drawing_by_as_much() -> None:
-    torch.manual_seed(0)
-    picture = torch.rand(1, 1, 1, 16, 16)
-    scale = torch.full((1, 1, 2), 0.15)
-    here = paste(picture, torch.tensor([[[-0.2, 0.1]]]), scale, 64, 64, 2.6)
-    there = paste(picture, torch.tensor([[[-0.2 + 5 * 2 / 64, 0.1 - 3 * 2 / 64]]]), scale, 64, 64, 2.6)
-    torch.testing.assert_close(there, here.roll((-3, 5), (-2, -1)), atol=1e-5, rtol=1e-5)
 
 
 def test_drawing_is_equivariant_to_the_order_of_the_slots() -> None:
