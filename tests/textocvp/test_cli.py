@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.textocvp.conftest import PLACED, build
+from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
 
 TEXT = "put the red block in the blue bowl"
@@ -119,6 +120,16 @@ def test_training_says_what_is_missing_before_it_makes_anything(capsys, tmp_path
     (tmp_path / "none.h5").write_text("not HDF5")
     assert "none.h5" in says(capsys, ["train", "parser", *files], 1)
     assert not out.exists()
+
+
+def test_the_parser_of_stage_two_is_found_by_its_bundled_name(capsys, tmp_path) -> None:
+    write_toy_episodes(tmp_path / "toy.h5", [4, 4])
+    data = str(tmp_path / "toy.h5")
+    files = ["--data", data, "--val", data, "--out", str(tmp_path / "out")]
+    message = says(capsys, ["train", "predictor", "--parser", "tabletop-small", *files], 1)
+    assert "frames of 32 pixels, parser.image_size is 64" in message  # it knows the checkpoint's parser
+    message = says(capsys, ["train", "predictor", "--parser", "tabletop-smal", *files], 1)
+    assert "unknown checkpoint 'tabletop-smal'. Bundled checkpoints: " in message
 
 
 @pytest.mark.parametrize(
