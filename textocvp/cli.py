@@ -36,7 +36,7 @@ from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
 from textocvp.pretrained import WeightsError
 from textocvp.protocols import load_model
-from textocvp.text.pretrained import MINILM_PACKAGE, T5_HUB_ID
+from textocvp.text.pretrained import MINILM_PACKAGE, T5_HUB_ID, PretrainedTextConfig
 from textocvp.world_model import WorldModel
 
 
@@ -67,15 +67,13 @@ class RolloutCommand:
     out: Path = Path("imagined.gif")
     """Where to; the ending decides: .gif and .mp4 play, .png is a strip from left to right."""
     checkpoint: str = DEFAULT_CHECKPOINT
-    """A bundled name, a folder with config.json and model.safetensors, or a Hugging Face hub id
-    owner/name."""
+    """A bundled name, a folder with config.json and model.safetensors, or a Hugging Face hub id owner/name."""
     horizon: int = 24
     """How many frames to imagine."""
     seed: int = 0
     """Of the initial slots, for models that draw them at random."""
     resize: bool = False
-    """Shrink or enlarge the picture to the size the model was trained on, instead of refusing another
-    size."""
+    """Shrink or enlarge the picture to the size the model was trained on, instead of refusing another size."""
     device: str = "cpu"
     """Where to compute: cpu, cuda, mps."""
 
@@ -140,8 +138,7 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def _train(arguments: list[str]) -> None:
-    # Imported here because training brings libraries that take seconds to load and that the other commands
-    # never use.
+    # Imported here because training brings libraries that take seconds to load.
     from textocvp.baselines.mage import train_mage, train_vqvae
     from textocvp.data.episodes import EpisodeFile
     from textocvp.data.feature_cache import FeatureCacheError
@@ -164,7 +161,7 @@ def _train(arguments: list[str]) -> None:
         "TensorBoard (OUT/logs), and go on where they stopped when they are started again.",
         args=arguments,
     )
-    # What can be known to be wrong is said at once, before anything is built or written.
+    # Said before anything is built or written.
     try:
         if chosen.preset is not None:
             of_mage = isinstance(chosen, (train_vqvae.VQVAETraining, train_mage.MageTraining))
@@ -253,17 +250,14 @@ def _tree(name: str, settings: dict[str, Any]) -> Tree:
 
 @dataclass(frozen=True)
 class ListedModel:
-    """A model in the list that `textocvp models` prints.
+    """A line of the list that `textocvp models` prints.
 
     Attributes:
         name: of its preset or its bundled checkpoint.
         what: what it is, in a few words.
-        parameters: those that training learns, a frozen encoder's left out. None for a model that cannot be built here.
-        predictor: those of them that predict: of MAGE its second stage (text and axial transformer), as the paper
-            counts.
-        state: `trained here`: a checkpoint is in the package. `not trained here`: it can be, with nothing but data.
-            `needs weights`: it can be, once the pretrained weights of a frozen encoder are there. `figures only`: no
-            code.
+        parameters: those that training learns, without frozen encoders. None for a model that cannot be built here.
+        predictor: those of them that predict; of MAGE text and axial transformer, as the paper counts.
+        state: whether a checkpoint is in the package, else what training it needs: data only, or also weights.
         weights: where its weights come from.
     """
 
@@ -277,12 +271,12 @@ class ListedModel:
 
 # The one model of the paper's comparison that is not in this package; docs/models.md says why.
 SEER = ListedModel(
-    name="seer",
-    what="SEER, a latent diffusion model of 406 M parameters (as published)",
-    parameters=None,
-    predictor=None,
-    state="figures only",
-    weights="its authors' checkpoint, which nothing here reads: see docs/models.md",
+    "seer",
+    "SEER, a latent diffusion model of 406 M parameters (as published)",
+    None,
+    None,
+    "figures only",
+    "its authors' checkpoint, which nothing here reads: see docs/models.md",
 )
 
 
@@ -313,25 +307,17 @@ def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
         weights = f"textocvp train parser --preset {name}, then train predictor"
         if name != shipped.name and (config.parser, config.renderer) == (shipped.parser, shipped.renderer):
             weights = f"textocvp train predictor --preset {name} on the parser of {shipped.name}"
-    needed = []
-    if getattr(images, "encoder", "") == "dinov2":
-        needed.append(images.encoder_weights or DINO_HUB_ID)
-    if config.text.kind in ("t5", "minilm"):
-        needed.append(config.text.weights or (T5_HUB_ID if config.text.kind == "t5" else MINILM_PACKAGE))
-    if bundled:
-        weights = "in this package"
-    return ListedModel(
-        name=name,
-        what=DESCRIPTIONS.get(name, ""),
-        parameters=_learnable(parts),
-        predictor=_learnable(predictor),
-        state="trained here" if bundled else "needs weights" if needed else "not trained here",
-        weights=f"{', '.join(needed)}; {weights}" if needed else weights,
-    )
-
-
-def _learnable(parts: list[torch.nn.Module]) -> int:
-    return sum(p.numel() for part in parts for p in part.parameters() if p.requires_grad)
+    needed = [images.encoder_weights or DINO_HUB_ID] if getattr(images, "encoder", "") == "dinov2" else []
+    if isinstance(config.text, PretrainedTextConfig):
+        default = T5_HUB_ID if config.text.kind == "t5" else MINILM_PACKAGE
+        needed.append(config.text.weights or default)
+    weights = "; ".join([*needed, "in this package" if bundled else weights])
+    counts = [
+        sum(p.numel() for part in some for p in part.parameters() if p.requires_grad)
+        for some in (parts, predictor)
+    ]
+    state: Any = "trained here" if bundled else "needs weights" if needed else "not trained here"
+    return ListedModel(name, DESCRIPTIONS.get(name, ""), counts[0], counts[1], state, weights)
 
 
 def _models() -> None:

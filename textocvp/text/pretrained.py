@@ -160,9 +160,11 @@ class PretrainedEncoder(TextEncoder):
                 f"text.max_tokens={config.max_tokens}: {config.kind} reads {longest} tokens at most"
             )
         self.pad = self._architecture.pad_token_id
-        encoder = new_encoder(self._architecture)
+        encoder = build_encoder(
+            self._architecture
+        )  # also where weights follow: a seed draws the rest as ever
         if not stored:
-            encoder.load_state_dict(pretrained_encoder(folder, self._architecture).state_dict())
+            encoder.load_state_dict(build_encoder(self._architecture, folder).state_dict())
         self.frozen = FrozenStates(encoder) if config.frozen else None
         self.encoder = None if config.frozen else encoder
         if config.frozen:
@@ -220,17 +222,11 @@ def read_tokenizer(folder: Path) -> Tokenizer:
     return tokenizer
 
 
-def new_encoder(config: PretrainedConfig) -> nn.Module:
-    """The encoder of that architecture with random weights, for a checkpoint to fill."""
+def build_encoder(config: PretrainedConfig, folder: Path | None = None) -> nn.Module:
+    """The encoder of that architecture, with the weights in `folder` or random ones; errors as `read_model`."""
     # Of T5 only the stack: its embedding table is registered twice in the whole model.
     if isinstance(config, T5Config):
-        return T5EncoderModel(config).encoder
+        return (read_model(T5EncoderModel, folder) if folder else T5EncoderModel(config)).encoder
     assert isinstance(config, BertConfig)
-    return BertModel(config, add_pooling_layer=False)
-
-
-def pretrained_encoder(folder: Path, config: PretrainedConfig) -> nn.Module:
-    """The encoder of that architecture with the weights in `folder`; errors as `read_model`."""
-    if isinstance(config, T5Config):
-        return read_model(T5EncoderModel, folder).encoder
-    return read_model(BertModel, folder, add_pooling_layer=False)
+    pooler = {"add_pooling_layer": False}
+    return read_model(BertModel, folder, **pooler) if folder else BertModel(config, **pooler)

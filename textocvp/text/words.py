@@ -27,23 +27,8 @@ SPECIAL = ("<pad>", "<unk>", "<color>")
 PAD, UNKNOWN, COLOR = range(3)
 
 # The words of the tabletop's sentences and its training colours: the vocabulary of the presets.
-GRAMMAR = (
-    "put",
-    "the",
-    "block",
-    "in",
-    "bowl",
-    "and",
-    "then",
-    "into",
-    "a",
-    "on",
-    "place",
-    "move",
-    "of",
-    "with",
-    "to",
-)
+GRAMMAR = ("put", "the", "block", "in", "bowl", "and", "then", "into", "a", "on", "place", "move", "of", "with",
+           "to")  # fmt: skip
 TRAIN_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
 
 _WORD = re.compile(r"[a-z0-9']+")
@@ -51,19 +36,10 @@ _WORD = re.compile(r"[a-z0-9']+")
 # Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
 # calls #76b7b2 teal; captions of tabletop scenes call it cyan. It goes by both names.
 TABLEAU_10 = {
-    "blue": "#4e79a7",
-    "orange": "#f28e2b",
-    "red": "#e15759",
-    "teal": "#76b7b2",
-    "cyan": "#76b7b2",
-    "green": "#59a14f",
-    "yellow": "#edc948",
-    "purple": "#b07aa1",
-    "pink": "#ff9da7",
-    "brown": "#9c755f",
-    "gray": "#bab0ac",
-    "grey": "#bab0ac",
-}
+    "blue": "#4e79a7", "orange": "#f28e2b", "red": "#e15759", "teal": "#76b7b2", "cyan": "#76b7b2",
+    "green": "#59a14f", "yellow": "#edc948", "purple": "#b07aa1", "pink": "#ff9da7", "brown": "#9c755f",
+    "gray": "#bab0ac", "grey": "#bab0ac",
+}  # fmt: skip
 
 
 @cache
@@ -123,9 +99,8 @@ class WordsConfig(TextConfig):
         words = dict.fromkeys([*self.vocabulary, *colors, *new, *sorted(found)])
         if self.words_have_rgb:
             words = {word: None for word in words if word in self.vocabulary or (word,) not in palette()}
-        return replace(
-            self, vocabulary=tuple(words), untrained=tuple(word for word in words if word not in found)
-        )
+        untrained = tuple(word for word in words if word not in found)
+        return replace(self, vocabulary=tuple(words), untrained=untrained)
 
 
 class _Block(nn.Module):
@@ -196,14 +171,8 @@ class WordEncoder(TextEncoder):
         return (UNKNOWN, None) if color is None else (COLOR, color)
 
     def unknown_words(self, text: str) -> list[str]:
-        untrained = self.config.untrained
-        return list(
-            dict.fromkeys(
-                word
-                for word in self.words(text)
-                if word in untrained or self._row_and_color(word)[0] == UNKNOWN
-            )
-        )
+        words = dict.fromkeys(self.words(text))
+        return [w for w in words if w in self.config.untrained or self._row_and_color(w)[0] == UNKNOWN]
 
     def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
         return [self._row_and_color(word) for word in self.words(text)]
