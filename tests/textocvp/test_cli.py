@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from tests.textocvp.conftest import PLACED, build
+from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
-from textocvp.catalogue import catalogue
 
 TEXT = "put the red block in the blue bowl"
 
@@ -99,7 +99,7 @@ def test_models_says_of_every_preset_what_it_is(capsys) -> None:
     assert cli.main(["models"]) == 0
     printed = capsys.readouterr().out
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in printed.splitlines()]
-    for entry in catalogue():
+    for entry in cli.list_models():
         counts = ["-" if n is None else f"{n:,}" for n in (entry.parameters, entry.predictor)]
         assert [entry.name, entry.what, *counts, entry.state, entry.weights] in rows
     assert cli.main(["info"]) == 0
@@ -120,6 +120,16 @@ def test_training_says_what_is_missing_before_it_makes_anything(capsys, tmp_path
     (tmp_path / "none.h5").write_text("not HDF5")
     assert "none.h5" in says(capsys, ["train", "parser", *files], 1)
     assert not out.exists()
+
+
+def test_the_parser_of_stage_two_is_found_by_its_bundled_name(capsys, tmp_path) -> None:
+    write_toy_episodes(tmp_path / "toy.h5", [4, 4])
+    data = str(tmp_path / "toy.h5")
+    files = ["--data", data, "--val", data, "--out", str(tmp_path / "out")]
+    message = says(capsys, ["train", "predictor", "--parser", "tabletop-small", *files], 1)
+    assert "frames of 32 pixels, parser.image_size is 64" in message  # it knows the checkpoint's parser
+    message = says(capsys, ["train", "predictor", "--parser", "tabletop-smal", *files], 1)
+    assert "unknown checkpoint 'tabletop-smal'. Bundled checkpoints: " in message
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.textocvp.conftest import PLACED, PUBLISHED, build
-from tests.textocvp.test_holistic import NON_OC
-from textocvp.config import ModelConfig
+from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
+from textocvp.config import ModelConfig, with_settings
 from textocvp.training.predictor import PredictorStage, PredictorTraining, assemble
-
-
-def variant(config: ModelConfig, **changes: object) -> ModelConfig:
-    return replace(config, predictor=replace(config.predictor, **changes))
 
 
 @pytest.mark.parametrize(
@@ -24,8 +18,8 @@ def variant(config: ModelConfig, **changes: object) -> ModelConfig:
         PLACED,
         PUBLISHED,
         NON_OC,
-        variant(PLACED, kind="ocvp-seq", color_bias=False),
-        variant(PUBLISHED, kind="ocvp-seq"),
+        with_settings(PLACED, ["predictor.kind=ocvp-seq"]),
+        with_settings(PUBLISHED, ["predictor.kind=ocvp-seq"]),
     ],
     ids=lambda config: f"{config.name}-{config.predictor.kind}",
 )

@@ -12,7 +12,7 @@ import torch
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel
-from textocvp.config import ModelConfig
+from textocvp.config import ModelConfig, with_settings
 from textocvp.training.predictor import PredictorTraining, extend_window, train, with_longer_window
 
 TEXT = "put the red block in the blue bowl"
@@ -25,7 +25,7 @@ def variant(config: ModelConfig, **changes: object) -> ModelConfig:
 @pytest.mark.parametrize("encoding", ["learned", "sinusoidal"])
 @pytest.mark.parametrize("kind", ["textocvp", "ocvp-seq"])
 def test_rollouts_within_the_old_window_stay_as_they_are(kind, encoding, scene: np.ndarray):
-    model = build(variant(PLACED, kind=kind, color_bias=False, age_encoding=encoding))
+    model = build(with_settings(PLACED, [f"predictor.kind={kind}", f"predictor.age_encoding={encoding}"]))
     world_model = WorldModel(model)
     before = world_model.rollout(scene, TEXT, horizon=8)
     extend_window(model, ["predictor.window=20"])

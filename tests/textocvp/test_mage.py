@@ -14,14 +14,14 @@ from torch import Tensor
 from textocvp.baselines.mage.config import AxialConfig, MageConfig, VQVAEConfig, mage_preset
 from textocvp.baselines.mage.model import Mage
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import TextConfig
 from textocvp.protocols import load_model
+from textocvp.text.words import WordsConfig
 from textocvp.world_model import WorldModel
 
 TINY = MageConfig(
     name="tiny",
     vqvae=VQVAEConfig(image_size=16, channels=8, blocks=1, codebook_size=12, code_dim=4),
-    text=TextConfig(kind="lexicon", dim=24, layers=1, heads=2, hidden=24),
+    text=WordsConfig(dim=24, layers=1, heads=2, hidden=24),
     axial=AxialConfig(dim=24, layers=6, heads=2, hidden=24, frames=6),
 )
 TEXTS = ["put the red block in the blue bowl", "put the green block in the yellow bowl"]
@@ -121,8 +121,9 @@ def test_the_bundled_one_is_its_preset_and_imagines_through_the_common_door() ->
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     frames = model.imagine(picture, TEXTS[0], horizon=2)
     assert frames.shape == (1, 3, 3, 64, 64) and frames.min() >= 0 and frames.max() <= 1
-    assert replace(model.model.config, name="mage-small") == mage_preset("mage-small")  # type: ignore[attr-defined]
+    config = model.model.config  # type: ignore[attr-defined]
+    assert replace(config, text=replace(config.text, untrained=())) == mage_preset("mage-small")
     with pytest.raises(ValueError, match="horizon"):
         model.imagine(picture, TEXTS[0], horizon=25)
-    with pytest.raises(CheckpointError, match="load_video_model"):
+    with pytest.raises(CheckpointError, match="load_model"):
         WorldModel.from_pretrained("mage-small")

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.textocvp.conftest import PLACED, PUBLISHED, build
-from tests.textocvp.test_holistic import NON_OC
+from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
 from textocvp import WorldModel
-from textocvp.config import ModelConfig
+from textocvp.config import ModelConfig, with_settings
 
 TEXT = "put the red block in the blue bowl"
 COLORS = [(255, 87, 89), (78, 121, 167), (89, 169, 79), (237, 201, 72)]
@@ -47,8 +46,7 @@ def test_placed_slots_find_as_many_things_as_there_are_slots() -> None:
 @pytest.mark.parametrize("config", [PLACED, PUBLISHED, CLUSTERS], ids=lambda config: config.name)
 @pytest.mark.parametrize("kind", ["textocvp", "ocvp-seq"])
 def test_every_slot_model_takes_more_slots_and_fewer(config: ModelConfig, kind: str) -> None:
-    predictor = replace(config.predictor, kind=kind, color_bias=False)
-    world_model = WorldModel(build(replace(config, predictor=predictor)))
+    world_model = WorldModel(build(with_settings(config, [f"predictor.kind={kind}"])))
     for slots in (3, 9):
         rollout = world_model.rollout(squares(3), TEXT, horizon=3, seed=1, num_slots=slots)
         assert rollout.slots.shape[2] == slots and rollout.slots.isfinite().all()

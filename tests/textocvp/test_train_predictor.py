@@ -11,13 +11,15 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import ModelConfig, PredictorConfig, TextConfig
+from textocvp.config import ModelConfig
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatches
 from textocvp.data.slot_cache import SlotCache
 from textocvp.model import TextOCVP
+from textocvp.predictors.ocvp_seq import OCVPSeqConfig
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
+from textocvp.text.words import WordsConfig
 from textocvp.training import run as training
 from textocvp.training.evaluate_predictor import FollowingTest, Thing, ask, things_of
 from textocvp.training.losses import moving_weights, slot_loss
@@ -35,9 +37,7 @@ LAYOUT = SlotLayout(content=4)
 OCVP_SEQ = replace(
     PLACED,
     name="tiny-ocvp-seq",
-    predictor=PredictorConfig(
-        kind="ocvp-seq", dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8
-    ),
+    predictor=OCVPSeqConfig(dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8),
 )
 
 
@@ -135,7 +135,7 @@ def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(run):
     args = run(PLACED, "run")
     for setting, words in (
         ("text.kind=transformer", r"set predictor\.color_bias=false"),
-        ("predictor.layer=2", r"unknown setting 'predictor\.layer'"),
+        ("predictor.layer=2", r"predictor has no field 'layer'"),
         ("predictor.heads=3", "heads"),
     ):
         with pytest.raises(training.SettingsError, match=words):
@@ -218,7 +218,7 @@ def test_recoloring_permutes_scene_and_words_alike():
 
 def test_words_without_rgb_stop_all_recoloring():
     """Else "red" would be taught to mean whatever colour the red block was given."""
-    text = build_text_encoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    text = build_text_encoder(WordsConfig(kind="transformer", dim=16, heads=2, hidden=16))
     plain, asked = (
         SlotBatches(scenes(), LAYOUT, text, 6, color_jitter=0.0, place_jitter=0.0, **settings)
         for settings in (dict(recolor=False, color_spread=0.0), dict(recolor=True, color_spread=0.5))

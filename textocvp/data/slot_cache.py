@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from textocvp.config import ParserConfig
 from textocvp.parsers.base import to_frames
 
 if TYPE_CHECKING:
@@ -100,24 +99,10 @@ class SlotCache:
             raise SlotCacheError(f"{path} is no slot cache, or damaged: {error}") from error
 
 
-LATER_FIELDS = (
-    "pool_cells",
-    "encoder",
-    "encoder_dim",
-    "encoder_patch",
-    "encoder_fingerprint",
-)
-"""Fields of `ParserConfig` that came after the first caches: they count only where they are not at their default."""
-
-
 def parser_fingerprint(model: TextOCVP) -> str:
     """A hash of the parser's configuration and weights; of a frozen encoder's weights, their fingerprint."""
-    defaults, settings = asdict(ParserConfig()), model.config.to_dict()["parser"]
-    settings = {
-        name: value
-        for name, value in settings.items()
-        if not (name in LATER_FIELDS and value == defaults[name]) and name != "encoder_weights"
-    }
+    settings = model.config.to_dict()["parser"]
+    settings.pop("encoder_weights", None)  # where they were found, not what they are
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name, tensor in sorted(model.parser.state_dict().items()):
         digest.update(name.encode())

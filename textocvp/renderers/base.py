@@ -1,12 +1,24 @@
-"""From slots to frames and masks: the interface that every renderer has, and the one place that picks one."""
+"""From slots to frames and masks: what every renderer is."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """What every renderer is built from; a subclass adds its own options and refuses values that make no sense.
+
+    Attributes:
+        kind: name in `textocvp.renderers.RENDERERS`.
+    """
+
+    kind: str
 
 
 @dataclass
@@ -36,7 +48,16 @@ class Rendered:
 
 
 class Renderer(nn.Module):
-    """Slots to pixels. Subclasses write `forward` and, where colours cost much, a cheaper `masks`."""
+    """Slots to pixels. Subclasses set `Config` and write `forward` and, where colours cost much, a cheaper `masks`.
+
+    They are built from (config, layout, image_size): their sizes, what the numbers of one slot mean, and the side of
+    the square frames in pixels.
+
+    Attributes:
+        Config: the class of its configuration.
+    """
+
+    Config: ClassVar[type[RendererConfig]]
 
     @abstractmethod
     def forward(self, slots_BKD: Tensor) -> Rendered:

@@ -247,7 +247,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
 def _all_features(
     model: TextOCVP, episodes: EpisodeFile, folder: Path, accelerator: Accelerator
 ) -> FeatureCache:
-    dino = getattr(model.parser, "dino", None)
+    dino = model.parser.dino
     if dino is None:
         raise SettingsError("cache_features needs a parser with a frozen encoder: parser.encoder=dinov2")
     share = (accelerator.process_index, accelerator.num_processes)

@@ -25,12 +25,13 @@ from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from textocvp.config import ModelConfig, PredictorConfig, with_settings
+from textocvp.config import ModelConfig, with_settings
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatch, SlotBatches, true_frames
 from textocvp.data.slot_cache import SlotCache, cached_slots, parse_share
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
+from textocvp.predictors import PredictorConfig
 from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import TextEncoder, WordBatch
@@ -134,8 +135,8 @@ def train(args: PredictorTraining) -> InstructionFollowing | None:
     """
     accelerator = start(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = assemble(args).to(accelerator.device)
     with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
+        model = assemble(args, episodes.instructions).to(accelerator.device)
         check_frame_size(model.config.parser.image_size, "parser.image_size", episodes, held_out)
         for file, name in ((episodes, "train"), (held_out, "val")):
             share = (accelerator.process_index, accelerator.num_processes)
@@ -165,8 +166,11 @@ def train(args: PredictorTraining) -> InstructionFollowing | None:
     return following
 
 
-def assemble(args: PredictorTraining) -> TextOCVP:
+def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
     """A model with the trained parser and renderer, frozen, and a text encoder and a predictor to train.
+
+    Args:
+        captions: what a new text encoder is trained on.
 
     Raises:
         SettingsError: if an option would change the architecture of what is to be fine-tuned (but for a longer window),
@@ -189,16 +193,15 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     if args.preset is not None:
         chosen = preset(args.preset)
         config = dataclasses.replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
-    # The text encoder is new, and so are its weights if they are frozen ones.
-    text = dataclasses.replace(config.text, fingerprint="")
-    config = dataclasses.replace(config, text=text, stage="predictor")
     for setting in args.set:
         if not setting.startswith(("predictor.", "text.")):
             raise SettingsError(
                 f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
             )
     with allowed_settings():
-        model = TextOCVP(with_settings(config, args.set))
+        config = with_settings(config, args.set)
+        text = config.text.for_captions(captions)
+        model = TextOCVP(dataclasses.replace(config, text=text, stage="predictor"))
     for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
         part.load_state_dict(source.state_dict())
         part.requires_grad_(False).eval()

@@ -1,24 +1,29 @@
-"""The catalogue of models: complete, counted on the models themselves, and true about what is in the package."""
+"""Presets: all of them train, and the list of models is complete, counted on them, and true about what is bundled."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
+import torch
 
 from tests.textocvp.conftest import PLACED
-from textocvp import catalogue as module
+from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
+from tests.textocvp.toy_episodes import write_toy_episodes
+from textocvp import cli
 from textocvp.baselines.mage.config import MAGE_PRESETS
 from textocvp.baselines.mage.model import Mage
-from textocvp.catalogue import Entry, catalogue
+from textocvp.cli import ListedModel, list_models
+from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS
 from textocvp.world_model import bundled_checkpoints
 
 
-def entries() -> dict[str, Entry]:
-    found = {entry.name: entry for entry in catalogue()}
-    assert len(found) == len(catalogue())
+def entries() -> dict[str, ListedModel]:
+    found = {entry.name: entry for entry in list_models()}
+    assert len(found) == len(list_models())
     return found
 
 
@@ -49,7 +54,7 @@ def test_counts_are_those_of_the_real_models() -> None:
 
 def test_the_state_follows_what_is_bundled(monkeypatch: pytest.MonkeyPatch) -> None:
     for bundled in ([], ["savi-cater", "tabletop-small"]):
-        monkeypatch.setattr(module, "bundled_checkpoints", lambda names=bundled: names)
+        monkeypatch.setattr(cli, "bundled_checkpoints", lambda names=bundled: names)
         found = entries()
         for name in ("savi-cater", "tabletop-small", "ocvp-seq-small"):
             here = name in bundled
@@ -67,8 +72,49 @@ def test_a_frozen_encoder_needs_its_weights(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_second_stage_alone_is_said_to_be_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "bundled_checkpoints", lambda: [])
+    monkeypatch.setattr(cli, "bundled_checkpoints", lambda: [])
     monkeypatch.setitem(PRESETS, PLACED.name, PLACED)
     found = entries()
     assert "train parser" not in found["ocvp-seq-small"].weights
     assert found[PLACED.name].weights == f"textocvp train parser --preset {PLACED.name}, then train predictor"
+
+
+TOY = {
+    "parser": dict(image_size=32, num_slots=5, hidden=8, crop_cells=4, encoder_channels=4, pool_cells=2)
+    | dict(transition_hidden=8, encoder_dim=DIM, encoder_patch=PATCH),
+    "renderer": dict(hidden=8, crop_cells=4, channels=4, patches=8, layers=2)
+    | dict(feature_dim=DIM, image_channels=32),
+    "text": dict(dim=8, layers=1, heads=2, hidden=8),
+    "predictor": dict(dim=8, layers=1, heads=2, hidden=8, window=4),
+}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_trains_two_steps_of_both_stages_at_toy_size(name, tmp_path, monkeypatch) -> None:
+    data, sizes = PRESETS[name].to_dict(), copy.deepcopy(TOY)
+    data["parser"]["layout"]["content"] = 8
+    if data["parser"]["kind"] == "holistic":
+        sizes["parser"]["num_slots"] = 1
+    if data["parser"].get("encoder") == "dinov2":
+        data["parser"]["encoder_weights"] = str(write_tiny_dino(tmp_path / "dino"))
+    for part, values in sizes.items():
+        data[part] |= {field: value for field, value in values.items() if field in data[part]}
+    toy = ModelConfig.from_dict({**data, "name": "toy"})
+    monkeypatch.setitem(PRESETS, "toy", toy)
+    write_toy_episodes(tmp_path / "toy.h5", [6, 5, 6])
+    files = [f"--{option}={tmp_path / 'toy.h5'}" for option in ("data", "val")]
+    steps = ["--steps=2", "--batch=2", "--warmup=1"]
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert cli.main(["train", "parser", "--preset=toy", f"--out={first}", "--clip=2", *files, *steps]) == 0
+    command = ["train", "predictor", f"--parser={first / 'checkpoint'}", f"--out={second}", "--horizon=2"]
+    assert cli.main([*command, *files, *steps]) == 0
+    torch.manual_seed(0)
+    drawn = TextOCVP(toy).state_dict()
+    learned, trained = (TextOCVP.from_pretrained(out / "checkpoint").state_dict() for out in (first, second))
+
+    def changed(old: dict[str, torch.Tensor], new: dict[str, torch.Tensor]) -> set[str]:
+        same_shape = [name for name in old if old[name].shape == new[name].shape]
+        return {name.split(".")[0] for name in same_shape if not torch.equal(old[name], new[name])}
+
+    assert changed(drawn, learned) == {"parser", "renderer"}
+    assert changed(learned, trained) == {"text", "predictor"}
