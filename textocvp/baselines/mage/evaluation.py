@@ -9,14 +9,15 @@ import numpy as np
 import torch
 
 from textocvp.baselines.mage.model import Mage
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data.episodes import Episodes
 from textocvp.metrics.frames import psnr
 from textocvp.model import evaluating
 from textocvp.parsers.base import to_frames
+from textocvp.training.run import Metrics
 
 
 @dataclass(frozen=True)
-class Imagined:
+class Imagined(Metrics):
     """Figures of rollouts from the first frame to the longest horizon.
 
     Attributes:
@@ -42,7 +43,7 @@ class Imagined:
 
 
 @torch.no_grad()
-def measure(model: Mage, episodes: EpisodeFile, chosen: Iterable[int], batch: int = 8) -> Imagined:
+def measure(model: Mage, episodes: Episodes, chosen: Iterable[int], batch: int = 8) -> Imagined:
     """Figures over some episodes; frames after an episode's end are its last."""
     numbers = list(chosen)
     ratios: dict[str, list[torch.Tensor]] = {"psnr": [], "still_psnr": [], "redrawn_psnr": []}
@@ -50,7 +51,7 @@ def measure(model: Mage, episodes: EpisodeFile, chosen: Iterable[int], batch: in
     times_T = np.arange(model.config.axial.frames)
     for first in range(0, len(numbers), batch):
         part = numbers[first : first + batch]
-        clips = [clip[np.minimum(times_T, len(clip) - 1)] for clip in episodes.frames(part)]
+        clips = [clip[np.minimum(times_T, len(clip) - 1)] for clip in map(episodes.frames, part)]
         frames_BT3HW = to_frames(np.stack(clips), model.device)
         B, T = frames_BT3HW.shape[:2]
         true_BThw = model.vqvae.encode(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))

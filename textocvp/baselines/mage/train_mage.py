@@ -11,32 +11,30 @@ that it imagined itself, from which it must predict the true next codes (dataset
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from textocvp.baselines.mage.axial import code_loss
 from textocvp.baselines.mage.checkpoint import load_vqvae
-from textocvp.baselines.mage.codes import CodeCache, cached_codes
+from textocvp.baselines.mage.codes import cached_codes
 from textocvp.baselines.mage.config import mage_preset
 from textocvp.baselines.mage.evaluation import Imagined, measure
 from textocvp.baselines.mage.model import Mage
 from textocvp.config import with_settings
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data.cache import FrameCache
 from textocvp.text.base import WordBatch
 from textocvp.training.run import (
     Run,
     SettingsError,
     TrainingSettings,
     allowed_settings,
-    check_frame_size,
-    finish,
-    start,
+    close_run,
+    open_data,
+    open_run,
     step_rng,
 )
 
@@ -92,17 +90,21 @@ def train(args: MageTraining) -> Imagined | None:
 
     Raises:
         CheckpointError: if `vqvae` is no checkpoint of a VQ-VAE.
-        CodeCacheError: if `out` holds codes of another VQ-VAE or of other episodes.
+        CacheError: if `out` holds codes of another VQ-VAE or of other episodes.
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
-    accelerator = start(args.out, args.precision)
+    accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
     model = assemble(args).to(accelerator.device)
-    run, figures = Run(args, accelerator, MageStage(model)), None
-    with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        check_frame_size(model.config.vqvae.image_size, "vqvae.image_size", episodes, held_out)
-        with accelerator.main_process_first():
-            cache = cached_codes(model.vqvae, episodes, args.out / "codes-train.h5")
+    run = Run(args, accelerator, MageStage(model))
+    with open_data(args, model.config.vqvae.image_size, "vqvae.image_size") as (episodes, held_out):
+
+        def measured(count: int | None) -> Imagined:
+            return measure(model, held_out, range(len(held_out))[:count])
+
+        share = (accelerator.process_index, accelerator.num_processes)
+        cache = cached_codes(model.vqvae, episodes, args.out / "codes-train", *share)
+        accelerator.wait_for_everyone()
         words = model.text.lookup(episodes.instructions)
         for step in run.steps("mage"):
             rng = step_rng(args.seed, step)
@@ -111,7 +113,7 @@ def train(args: MageTraining) -> Imagined | None:
             codes_BThw = codes_BThw.to(run.device)
             weights_BThw = 1 + args.changed_weight * (codes_BThw[:, 1:] != codes_BThw[:, :1])
             whole = run.total(weights_BThw.sum())
-            for part in run.parts():
+            for part in run.micro_batches():
                 codes, weights = codes_BThw[part], model.axial.patches(weights_BThw[part])
                 seen, target = codes[:, : codes.shape[1] - 1 - imagined], model.axial.patches(codes[:, 1:])
                 speed_B = torch.full((len(codes),), float(speed), device=run.device)
@@ -119,18 +121,10 @@ def train(args: MageTraining) -> Imagined | None:
                     scores = run.module(seen, words.select(chosen[part]), speed_B, imagined)
                 run.backward(code_loss(scores, target, weights) / whole)
             run.update(step, {"imagined": float(imagined)})
-
-            if run.is_main and (step + 1) % args.evaluate_every == 0:
-                figures = measure(model, held_out, range(min(args.evaluate_episodes, len(held_out))))
-                run.log(step, {f"val/{name}": value for name, value in asdict(figures).items()})
-                tqdm.write(f"step {step + 1}: {figures}")
-        if run.is_main:
-            model.save(args.out / "checkpoint")
-            figures = measure(model, held_out, range(len(held_out)))
-            print(f"final: {figures}")
-            (args.out / "imagined.json").write_text(json.dumps(asdict(figures), indent=2) + "\n")
-    finish(accelerator)
-    return figures
+            run.evaluate(step, measured)
+        metrics = run.finish(model.save, measured, "imagined.json")
+    close_run(accelerator)
+    return metrics
 
 
 def assemble(args: MageTraining) -> Mage:
@@ -160,10 +154,10 @@ def next_imagined(args: MageTraining, step: int, frames: int, rng: np.random.Gen
 
 
 def draw(
-    args: MageTraining, cache: CodeCache, frames: int, rng: np.random.Generator, rows: slice
+    args: MageTraining, cache: FrameCache, frames: int, rng: np.random.Generator, rows: slice
 ) -> tuple[Tensor, int, Tensor]:
     """These rows of a step's batch: codes (B, T, h, w), the stride between their frames, the episodes' numbers (B)."""
     stride = int(rng.integers(1, args.stride + 1))
     chosen_B = rng.integers(len(cache), size=args.batch)[rows]
-    codes_BThw = cache.clips(chosen_B, stride * np.arange(frames))
+    codes_BThw = torch.from_numpy(cache.at(chosen_B, stride * np.arange(frames)).astype(np.int64))
     return codes_BThw, stride, torch.from_numpy(chosen_B)
