@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-
 from tests.textocvp.both_stages import MAGE
+
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.baselines.mage import train_mage, train_vqvae
