@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tests.textocvp.both_stages import MAGE
 
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
+from tests.textocvp.training.both_stages import MAGE
 from textocvp.baselines.mage import train_mage, train_vqvae
 from textocvp.baselines.mage.checkpoint import load_vqvae
-from textocvp.baselines.mage.codes import CodeCache, CodeCacheError, cached_codes
+from textocvp.baselines.mage.codes import cached_codes
 from textocvp.baselines.mage.config import MAGE_PRESETS
 from textocvp.baselines.mage.model import Mage
 from textocvp.baselines.mage.train_mage import MageTraining
 from textocvp.baselines.mage.train_vqvae import VQVAETraining
 from textocvp.baselines.mage.vqvae import VQVAE, Codebook, perplexity
 from textocvp.checkpoint import CheckpointError
+from textocvp.data.cache import CacheError
 from textocvp.data.episodes import EpisodeFile
 from textocvp.training import run as training
 from textocvp.training.run import SettingsError
@@ -94,25 +95,19 @@ def test_codes_are_kept_for_the_vqvae_that_made_them(folder: Path) -> None:
     torch.manual_seed(0)
     one, other = VQVAE(MAGE.vqvae).eval(), VQVAE(MAGE.vqvae).eval()
     with EpisodeFile(folder / "train.h5") as episodes, EpisodeFile(folder / "val.h5") as others:
-        cache = cached_codes(one, episodes, folder / "codes.h5")
-        again = cached_codes(one, episodes, folder / "codes.h5")
-        assert np.array_equal(cache.codes_Nhw, again.codes_Nhw) and len(again) == 4
+        cache = cached_codes(one, episodes, folder / "codes")
+        again = cached_codes(one, episodes, folder / "codes")
+        assert np.array_equal(cache.values, again.values) and len(again) == 4
         frames = torch.from_numpy(episodes.episode(1).frames).permute(0, 3, 1, 2).float() / 127.5 - 1
         with torch.no_grad():
-            assert np.array_equal(again.codes_Nhw[9:17], one.encode(frames).numpy())
-        with pytest.raises(CodeCacheError, match="other vqvae"):
-            cached_codes(other, episodes, folder / "codes.h5")
-        with pytest.raises(CodeCacheError, match="other episodes"):
-            cached_codes(one, others, folder / "codes.h5")
-        (folder / "codes.h5").write_bytes(b"no HDF5")
-        with pytest.raises(CodeCacheError, match="damaged"):
-            cached_codes(one, episodes, folder / "codes.h5")
-
-
-def test_an_episode_that_has_ended_stays_as_it_is() -> None:
-    cache = CodeCache(np.arange(5, dtype=np.uint16)[:, None, None], np.array([0, 3, 5]))
-    clips = cache.clips(np.array([0, 1]), np.arange(4))
-    assert clips[:, :, 0, 0].tolist() == [[0, 1, 2, 2], [3, 4, 4, 4]]
+            assert np.array_equal(again.values[9:17], one.encode(frames).numpy())
+        with pytest.raises(CacheError, match="by another network"):
+            cached_codes(other, episodes, folder / "codes")
+        with pytest.raises(CacheError, match="other episodes"):
+            cached_codes(one, others, folder / "codes")
+        (folder / "codes" / "000000.h5").write_bytes(b"no HDF5")
+        with pytest.raises(CacheError, match="damaged"):
+            cached_codes(one, episodes, folder / "codes")
 
 
 def test_what_does_not_fit_is_refused_by_name(folder: Path) -> None:
