@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.textocvp.conftest import PLACED, PUBLISHED, build
-from tests.textocvp.test_holistic import NON_OC
+from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
 from textocvp.config import ModelConfig
 from textocvp.training.predictor import PredictorStage, PredictorTraining, assemble
 
@@ -29,10 +28,9 @@ def variant(config: ModelConfig, **changes: object) -> ModelConfig:
     ],
     ids=lambda config: f"{config.name}-{config.predictor.kind}",
 )
-def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: Path) -> None:
-    build(config).save_pretrained(tmp_path)
+def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig) -> None:
     nowhere = Path()
-    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=tmp_path))
+    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=nowhere), build(config))
     frames_B1 = torch.rand(2, 1, 3, 32, 32) * 2 - 1
     frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
     slots_B1KD = model.parser(frames_B1).slots_BTKD

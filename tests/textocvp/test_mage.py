@@ -14,14 +14,14 @@ from torch import Tensor
 from textocvp.baselines.mage.config import AxialConfig, MageConfig, VQVAEConfig, mage_preset
 from textocvp.baselines.mage.model import Mage
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import TextConfig
 from textocvp.protocols import load_model
+from textocvp.text.words import WordsConfig
 from textocvp.world_model import WorldModel
 
 TINY = MageConfig(
     name="tiny",
     vqvae=VQVAEConfig(image_size=16, channels=8, blocks=1, codebook_size=12, code_dim=4),
-    text=TextConfig(kind="lexicon", dim=24, layers=1, heads=2, hidden=24),
+    text=WordsConfig(dim=24, layers=1, heads=2, hidden=24),
     axial=AxialConfig(dim=24, layers=6, heads=2, hidden=24, frames=6),
 )
 TEXTS = ["put the red block in the blue bowl", "put the green block in the yellow bowl"]

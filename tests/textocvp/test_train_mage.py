@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
+from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from tests.textocvp.training.both_stages import MAGE
 from textocvp.baselines.mage import train_mage, train_vqvae

@@ -234,7 +234,7 @@ def cached_features(
     At the published size they are 0.9 MB a frame. `batch` frames are encoded at once.
 
     Raises:
-        DinoWeightsError: if the encoder's weights are missing.
+        WeightsError: if the encoder's weights are missing.
         CacheError: if `folder` holds features of another encoder or of other episodes.
     """
 

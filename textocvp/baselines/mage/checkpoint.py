@@ -41,7 +41,7 @@ def load_vqvae(folder: Path) -> VQVAE:
             f"{folder} holds a {found!r} model, and this needs one of {VQVAE_ARCHITECTURE!r}"
         )
     try:
-        model = VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "config.vqvae"))
+        model = VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "vqvae"))
     except ValueError as error:
         raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
     load_weights(model, folder / WEIGHTS_FILE)

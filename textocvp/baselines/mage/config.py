@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from textocvp.config import TextConfig, build
+from textocvp.config import build
+from textocvp.text import ENCODERS, TextConfig
+from textocvp.text.words import WordsConfig
 
 ARCHITECTURE: Literal["mage"] = "mage"
 """What `architecture` says in the `config.json` of a checkpoint."""
@@ -57,7 +59,7 @@ class PublishedTextConfig:
     """MAGE's own text transformer: words to tokens, with learned positions.
 
     Attributes:
-        kind: always `published`; tells this from a `textocvp.config.TextConfig`.
+        kind: always `published`; tells this from a `textocvp.text.TextConfig`.
         dim, layers, heads, hidden: the transformer.
         max_tokens: longest sentence in words; a longer one is an error.
         vocabulary: rows of the word embedding. More than there are words: the rest is never used, as published.
@@ -105,6 +107,10 @@ class MageConfig:
         architecture: always `mage`; tells its checkpoints from others.
     """
 
+    KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {
+        "text": {**ENCODERS, "published": PublishedTextConfig},
+    }
+
     name: str
     vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
     text: TextConfig | PublishedTextConfig = field(default_factory=PublishedTextConfig)
@@ -120,13 +126,9 @@ class MageConfig:
         """The inverse of `to_dict`.
 
         Raises:
-            ValueError: if a field is unknown or missing; the message gives its full name and the fields that exist.
+            ValueError: see `textocvp.config.build`.
         """
-        text = data.get("text")
-        if isinstance(text, Mapping):
-            kind = PublishedTextConfig if text.get("kind") == "published" else TextConfig
-            data = {**data, "text": build(kind, text, "config.text")}
-        return build(cls, data, "config")
+        return build(cls, data)
 
 
 MAGE_PRESETS: dict[str, MageConfig] = {
@@ -137,7 +139,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
     "mage-small": MageConfig(
         name="mage-small",
         vqvae=VQVAEConfig(channels=64, code_dim=64),
-        text=TextConfig(kind="lexicon"),
+        text=WordsConfig(kind="lexicon"),
         axial=AxialConfig(dim=128, heads=4, hidden=256, frames=25, patch=2, copy=True),
     ),
     # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).

@@ -13,9 +13,8 @@ from torch import Tensor, nn
 
 from textocvp.baselines.mage.attention import BiasedAttention, FeedForward
 from textocvp.baselines.mage.config import PublishedTextConfig
-from textocvp.config import TextConfig
 from textocvp.layers import MASKED
-from textocvp.text import build_text_encoder
+from textocvp.text import TextConfig, build_text_encoder
 from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
 from textocvp.text.words import GRAMMAR, TRAIN_COLORS
 
@@ -50,7 +49,7 @@ class PublishedText(TextEncoder):
     config: PublishedTextConfig  # type: ignore[assignment]
 
     def __init__(self, config: PublishedTextConfig) -> None:
-        super().__init__()
+        super().__init__(config)  # type: ignore[arg-type]
         if config.vocabulary < len(WORDS):
             raise ValueError(f"text.vocabulary must be at least {len(WORDS)}, not {config.vocabulary}")
         self.config = config
