@@ -143,8 +143,8 @@ def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load and that the other commands
     # never use.
     from textocvp.baselines.mage import train_mage, train_vqvae
+    from textocvp.data import open_episodes
     from textocvp.data.cache import CacheError
-    from textocvp.data.episodes import open_episodes
     from textocvp.training import parser as train_parser
     from textocvp.training import predictor as train_predictor
     from textocvp.training.run import SettingsError

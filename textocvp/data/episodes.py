@@ -1,8 +1,4 @@
-"""Episodes: frames with a sentence each, and what is known of the scenes. One class a format, named in `FORMATS`.
-
-Another format is a subclass of `Episodes` in a file of its own and a line in `FORMATS`. `EpisodeFile` is the HDF5 file
-that `python -m envs.collect` writes. Nothing here knows the simulator.
-"""
+"""Episodes: frames with a sentence each, and what is known of the scenes. The HDF5 file that holds them."""
 
 from __future__ import annotations
 
@@ -195,7 +191,9 @@ class EpisodeFile(Episodes):
         self._file: h5py.File | None = None
         self._process = -1
         if not self.path.is_file():
-            raise FileNotFoundError(_no_such(self.path))
+            raise FileNotFoundError(
+                f"there is no episode file {self.path}; collect one with: python -m envs.collect --out {self.path}"
+            )
         try:
             file = self._open()
             self._version = self._check_format(file)
@@ -384,31 +382,3 @@ def swapped_questions(
 def words_of(sentences: Iterable[str]) -> set[str]:
     """All words of some sentences, lower case."""
     return set(re.findall(r"[a-z0-9']+", "\n".join(sentences).lower()))
-
-
-def _no_such(path: Path) -> str:
-    return f"there is no episode file {path}; collect one with: python -m envs.collect --out {path}"
-
-
-FORMATS: dict[str, type[Episodes]] = {"hdf5": EpisodeFile}
-"""Every format by name, in the order in which they are tried."""
-
-
-def open_episodes(path: str | os.PathLike[str], first: int | None = None) -> Episodes:
-    """Open episodes of whichever format.
-
-    Args:
-        path: a file or folder.
-        first: use only the first so many episodes.
-
-    Raises:
-        FileNotFoundError: when there is nothing at `path`.
-        ValueError: when no format knows it, it is damaged, or `first` is below 1.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(_no_such(path))
-    for kind in FORMATS.values():
-        if kind.detect(path):
-            return kind(path, first)
-    raise ValueError(f"{path} is not an episode file, nor of another format ({', '.join(FORMATS)})")

@@ -37,7 +37,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.data.episodes import Episodes, open_episodes
+from textocvp.data import open_episodes
+from textocvp.data.episodes import Episodes
 
 STEP_FILE = "step.json"
 LOG_EVERY = 20  # updates

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.data import episodes as module
+from textocvp.data import FORMATS, open_episodes
 from textocvp.data.episodes import (
     Episode,
     EpisodeFile,
     EpisodeObject,
     Episodes,
     Question,
-    open_episodes,
     swapped_questions,
 )
 
@@ -170,7 +169,7 @@ def test_another_format_is_a_class_and_a_line(tmp_path: Path, monkeypatch: pytes
     source.write_text("one two\nthree four five\nsix")
     with pytest.raises(ValueError, match=r"not an episode file, nor of another format \(hdf5\)"):
         open_episodes(source)
-    monkeypatch.setitem(module.FORMATS, "squares", _Squares)
+    monkeypatch.setitem(FORMATS, "squares", _Squares)
     with open_episodes(source, first=2) as file:
         assert len(file) == 2 and file.vocabulary == ("five", "four", "one", "three", "two")
         assert file.truth(0) is None
