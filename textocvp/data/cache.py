@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -36,9 +35,7 @@ class CacheError(ValueError):
 
 
 class FrameCache:
-    """One value for each frame of some episodes, on disk.
-
-    Picklable, and safe to use after a fork: each process opens the files for itself.
+    """One value for each frame of some episodes, on disk. Picklable, and safe to use after a fork: no file stays open.
 
     Args:
         folder: where the files are; those that are missing are made by `fill`.
@@ -57,8 +54,6 @@ class FrameCache:
         self.lengths, self.starts = episodes.lengths, episodes.starts
         self._made_from = {"network": network, "episodes": episodes.fingerprint}
         self._firsts = range(0, len(episodes), PART)
-        self._files: dict[int, h5py.File] = {}
-        self._process = -1
         for first in self._firsts:
             if self._path(first).exists():
                 self._check(first)
@@ -99,11 +94,7 @@ class FrameCache:
         Raises:
             CacheError: if a part is missing.
         """
-        values = np.concatenate([self._open(part)["values"][:] for part in range(len(self._firsts))])
-        for file in self._files.values():
-            file.close()
-        self._files = {}
-        return values
+        return np.concatenate([self._read(first, slice(None)) for first in self._firsts])
 
     def episode(self, index: int) -> NDArray[Any]:
         """The values (T, ...) of one episode, in memory."""
@@ -126,15 +117,11 @@ class FrameCache:
         edges = self.starts[::PART]
         parts = np.searchsorted(edges, starts, side="right") - 1
         rows = starts - edges[parts]
-        return np.stack(
-            [
-                self._open(int(part))["values"][row : row + length : stride]
-                for part, row in zip(parts, rows, strict=True)
-            ]
-        )
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_files": {}, "_process": -1}
+        read = [
+            self._read(self._firsts[part], slice(row, row + length, stride))
+            for part, row in zip(parts, rows, strict=True)
+        ]
+        return np.stack(read)
 
     def _path(self, first: int) -> Path:
         return self.folder / f"{first:06d}.h5"
@@ -156,17 +143,12 @@ class FrameCache:
         if count != frames:
             raise CacheError(f"{path} is damaged: values of {count} frames, there should be {frames}")
 
-    def _open(self, part: int) -> h5py.File:
-        # HDF5 handles must not be shared across a fork: two processes would move one file position.
-        if self._process != os.getpid():
-            self._files, self._process = {}, os.getpid()
-        if part not in self._files:
-            first = self._firsts[part]
-            if not self._path(first).exists():
-                raise CacheError(f"{self._path(first)} is missing: the cache is not complete")
-            self._check(first)
-            self._files[part] = h5py.File(self._path(first), "r")
-        return self._files[part]
+    def _read(self, first: int, rows: slice) -> NDArray[Any]:
+        try:
+            with h5py.File(self._path(first), "r") as file:
+                return file["values"][rows]
+        except FileNotFoundError:
+            raise CacheError(f"{self._path(first)} is missing: the cache is not complete") from None
 
 
 def weights_fingerprint(module: nn.Module, *also: str) -> str:

@@ -8,8 +8,8 @@ explicit places, are measured by how far imagined slots are from parsed ones.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from textocvp.data.cache import FrameCache
 from textocvp.data.episodes import Episodes, Question
+from textocvp.data.slot_batches import padded
 from textocvp.layers import pixel_grid
 from textocvp.metrics.intervals import Interval, bootstrap_interval
 from textocvp.model import TextOCVP, evaluating
@@ -29,6 +30,9 @@ PIXEL = 2 / 64  # the thresholds are for 64x64 frames; in -1..1
 REACHED = 6 * PIXEL  # an object that ends closer than this to where the other's slot started is at it
 MATCHED = 4 * PIXEL  # a slot farther than this from an object's centroid does not hold it
 BATCH = 64  # rollouts at a time
+
+NO_QUESTIONS = "the held-out episodes have no masks and questions: no instruction following"
+NO_PLACES = "slots have no explicit places: no instruction following"
 
 
 @dataclass(frozen=True)
@@ -101,9 +105,78 @@ class Trial:
 class Trials:
     """What is asked of the held-out episodes: at most one trial of each kind an episode; see `InstructionFollowing`."""
 
-    original: list[Trial]
-    other_target: list[Trial]
-    wrong_text: list[Trial]
+    original: list[Trial] = field(default_factory=list)
+    other_target: list[Trial] = field(default_factory=list)
+    wrong_text: list[Trial] = field(default_factory=list)
+
+    def add(
+        self,
+        episode: int,
+        played: Question,
+        questions: Sequence[Question],
+        slot_of: Mapping[int, int],
+        rng: np.random.Generator,
+    ) -> None:
+        """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence.
+
+        Args:
+            slot_of: the slot that holds each object, by the object's id; -1 for none.
+        """
+        moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
+        self.original.append(Trial(episode, played.text, moves, ends_at))
+        elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
+        if elsewhere:
+            other = elsewhere[rng.integers(len(elsewhere))]
+            self.other_target.append(Trial(episode, other.text, moves, slot_of[other.ends_at]))
+        wrong = [q for q in questions if q != played]
+        if wrong:
+            text = wrong[rng.integers(len(wrong))].text
+            self.wrong_text.append(Trial(episode, text, moves, ends_at))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out episodes as slots, and what is asked of them.
+
+    Attributes:
+        slots_ETKD: true slots of whole episodes, padded with their last frame.
+        instructions: their sentences.
+        layout: what the numbers of a slot mean.
+        trials: empty where instruction following cannot be measured; then slot errors are.
+    """
+
+    slots_ETKD: Tensor
+    instructions: tuple[str, ...]
+    layout: SlotLayout
+    trials: Trials
+
+    @classmethod
+    def of(
+        cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, seed: int = 0
+    ) -> HeldOut:
+        """Held-out episodes at a length of so many frames; `seed` picks what is asked."""
+        rng, trials = np.random.default_rng(seed), Trials()
+        for index in range(len(episodes)) if layout.explicit else ():
+            truth = episodes.truth(index)
+            played = truth and truth.question(episodes.instructions[index])
+            if truth is None or truth.segmentation is None or not played:
+                continue
+            state = SlotState.split(torch.from_numpy(slots.episode(index)[0].astype(np.float32)), layout)
+            slot_of = {
+                item.id: slot_at(state, *place_and_size(truth.segmentation[0] == item.label))
+                for item in truth.objects
+            }
+            trials.add(index, played, truth.questions, slot_of, rng)
+        return cls(padded(slots, frames).float(), episodes.instructions, layout, trials)
+
+    @property
+    def file(self) -> str:
+        """What the file of the figures is called."""
+        return "following.json" if self.trials.original else "slot_errors.json"
+
+    def measure(self, model: TextOCVP, count: int | None = None) -> InstructionFollowing | SlotErrors:
+        """Figures of the first `count` episodes (default: all)."""
+        return (evaluate_following if self.trials.original else evaluate_slots)(model, self, count)
 
 
 def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -124,56 +197,11 @@ def slot_at(state: SlotState, place_2: Tensor, size_2: Tensor) -> int:
     return int(cost_K.argmin()) if cost_K.isfinite().any() else -1
 
 
-def find_trials(held_out: Episodes, slots: FrameCache, layout: SlotLayout, seed: int = 0) -> Trials:
-    """What can be asked of the episodes: nothing of those without masks, or whose instruction is no question."""
-    rng, trials = np.random.default_rng(seed), Trials([], [], [])
-    for index in range(len(held_out)):
-        truth = held_out.truth(index)
-        played = truth and truth.question(held_out.instructions[index])
-        if truth is None or truth.segmentation is None or not played:
-            continue
-        state = SlotState.split(torch.from_numpy(slots.episode(index)[0].astype(np.float32)), layout)
-        slot_of = {
-            item.id: slot_at(state, *place_and_size(truth.segmentation[0] == item.label))
-            for item in truth.objects
-        }
-        add_trials(trials, index, played, truth.questions, slot_of, rng)
-    return trials
+def evaluate_following(model: TextOCVP, held: HeldOut, count: int | None = None) -> InstructionFollowing:
+    """Imagine the trials of the first `count` episodes (default: all) and see where the objects end."""
+    places_ETK2 = SlotState.split(held.slots_ETKD, held.layout).position
 
-
-def add_trials(
-    trials: Trials,
-    episode: int,
-    played: Question,
-    questions: Sequence[Question],
-    slot_of: dict[int, int],
-    rng: np.random.Generator,
-) -> None:
-    """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence."""
-    moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
-    trials.original.append(Trial(episode, played.text, moves, ends_at))
-    elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
-    if elsewhere:
-        other = elsewhere[rng.integers(len(elsewhere))]
-        trials.other_target.append(Trial(episode, other.text, moves, slot_of[other.ends_at]))
-    wrong = [q for q in questions if q != played]
-    if wrong:
-        text = wrong[rng.integers(len(wrong))].text
-        trials.wrong_text.append(Trial(episode, text, moves, ends_at))
-
-
-def evaluate_following(
-    model: TextOCVP, slots_ETKD: Tensor, trials: Trials, layout: SlotLayout, episodes: int | None = None
-) -> InstructionFollowing:
-    """Imagine the trials of the first `episodes` (default: all) and see where the objects end.
-
-    Args:
-        slots_ETKD: true slots of whole episodes, padded with their last frame.
-        layout: what the numbers of a slot mean.
-    """
-    places_ETK2 = SlotState.split(slots_ETKD, layout).position
-
-    def reached(asked: list[Trial], ends_NK2: Sequence[Tensor]) -> float:
+    def reached(asked: list[Trial], ends_NK2: list[Tensor]) -> float:
         return _share(
             trial.moves >= 0
             and trial.ends_at >= 0
@@ -182,10 +210,10 @@ def evaluate_following(
         )
 
     chosen = [
-        [trial for trial in kind if episodes is None or trial.episode < episodes]
-        for kind in (trials.original, trials.other_target, trials.wrong_text)
+        [trial for trial in kind if count is None or trial.episode < count]
+        for kind in (held.trials.original, held.trials.other_target, held.trials.wrong_text)
     ]
-    ends = [_ends(model, slots_ETKD, asked, layout) for asked in chosen]
+    ends = [_ends(model, held, asked) for asked in chosen]
     errors = [
         float((ends_K2[trial.moves] - places_ETK2[trial.episode, -1, trial.moves]).norm())
         for trial, ends_K2 in zip(chosen[0], ends[0], strict=True)
@@ -197,29 +225,18 @@ def evaluate_following(
     return InstructionFollowing(original, other_target, wrong_text, error_px, grounded, len(chosen[0]))
 
 
-def evaluate_slots(
-    model: TextOCVP,
-    slots_ETKD: Tensor,
-    sentences: Sequence[str],
-    layout: SlotLayout,
-    left_out: str,
-    episodes: int | None = None,
-) -> SlotErrors:
-    """Imagine the first `episodes` (default: all) with their own sentences, and compare all frames with the true slots.
-
-    Args:
-        slots_ETKD: as `evaluate_following`.
-        left_out: why it is not instruction following that is measured.
-    """
+def evaluate_slots(model: TextOCVP, held: HeldOut, count: int | None = None) -> SlotErrors:
+    """Imagine the first `count` episodes (default: all) with their own sentences, and compare with the true slots."""
     errors: list[float] = []
     still_errors: list[float] = []
-    count = len(sentences[:episodes])
-    for at in range(0, count, BATCH):
-        rows = slice(at, min(at + BATCH, count))
-        imagined_BSKD = _imagined(model, slots_ETKD[rows], sentences[rows])
-        for true_TKD, imagined_SKD in zip(slots_ETKD[rows], imagined_BSKD, strict=True):
-            errors.append(_slot_error(imagined_SKD, true_TKD, layout))
-            still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, layout))
+    slots_ETKD, sentences = held.slots_ETKD[:count], held.instructions[:count]
+    for at in range(0, len(sentences), BATCH):
+        true_BTKD = slots_ETKD[at : at + BATCH]
+        imagined_BSKD = _imagined(model, true_BTKD, sentences[at : at + BATCH])
+        for true_TKD, imagined_SKD in zip(true_BTKD, imagined_BSKD, strict=True):
+            errors.append(_slot_error(imagined_SKD, true_TKD, held.layout))
+            still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, held.layout))
+    left_out = NO_QUESTIONS if held.layout.explicit else NO_PLACES
     if np.isnan(errors).all():
         return SlotErrors(None, None, left_out)
     return SlotErrors(bootstrap_interval(errors), bootstrap_interval(still_errors), left_out)
@@ -243,14 +260,14 @@ def _imagined(model: TextOCVP, slots_BTKD: Tensor, sentences: Sequence[str]) -> 
     return rollout.slots_BSKD.float().cpu()
 
 
-def _ends(model: TextOCVP, slots_ETKD: Tensor, asked: list[Trial], layout: SlotLayout) -> list[Tensor]:
+def _ends(model: TextOCVP, held: HeldOut, asked: list[Trial]) -> list[Tensor]:
     """Where the slots end when each sentence is carried out, (K, 2) for each trial."""
     ends: list[Tensor] = []
     for at in range(0, len(asked), BATCH):
         chosen = asked[at : at + BATCH]
-        true_BTKD = slots_ETKD[[trial.episode for trial in chosen]]
+        true_BTKD = held.slots_ETKD[[trial.episode for trial in chosen]]
         last_BKD = _imagined(model, true_BTKD, [trial.text for trial in chosen])[:, -1]
-        ends.extend(SlotState.split(last_BKD, layout).position)
+        ends.extend(SlotState.split(last_BKD, held.layout).position)
     return ends
 
 

@@ -13,9 +13,9 @@ published.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,22 +24,16 @@ from torch import Tensor, nn
 
 from textocvp.checkpoint import resolve_checkpoint
 from textocvp.config import with_settings
-from textocvp.data.cache import FrameCache, cached_slots
+from textocvp.data.cache import cached_slots
 from textocvp.data.episodes import Episodes, words_of
-from textocvp.data.slot_batches import SlotBatches, padded, true_frames
+from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
 from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import TextEncoder, WordBatch
 from textocvp.text.words import WordsConfig
-from textocvp.training.evaluate_predictor import (
-    InstructionFollowing,
-    SlotErrors,
-    evaluate_following,
-    evaluate_slots,
-    find_trials,
-)
+from textocvp.training.evaluate_predictor import HeldOut, InstructionFollowing, SlotErrors
 from textocvp.training.losses import moving_weights, slot_loss
 from textocvp.training.run import (
     Run,
@@ -239,9 +233,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
             color_jitter=args.color_jitter,
             place_jitter=args.place_jitter,
         )
-        measure, file = held_out_figures(
-            model, held_out, padded(val_slots, batches.frames).float(), val_slots
-        )
+        held = HeldOut.of(held_out, val_slots, layout, batches.frames)
         std_C = content_units(model, batches, keep=args.finetune)
         run = Run(args, accelerator, PredictorStage(model))
         for step in run.steps("predictor"):
@@ -256,8 +248,8 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
                     total = total + args.image_weight * run.weight(part) * image
                 run.backward(total, loss.as_metrics())
             run.update(step, {"horizon": 1.0 + batch.imagined})
-            run.evaluate(step, measure)
-        metrics = run.finish(model.save_pretrained, measure, file)
+            run.evaluate(step, partial(held.measure, model))
+        metrics = run.finish(model.save_pretrained, partial(held.measure, model), held.file)
     close_run(accelerator)
     return metrics
 
@@ -283,10 +275,8 @@ def assemble(
             raise SettingsError(f"{args.parser} has no trained predictor to finetune: leave out finetune")
         with allowed_settings():
             extend_window(trained, args.set)
-        if isinstance(
-            trained.config.text, WordsConfig
-        ):  # words that these captions have are trained from now on
-            met = words_of(captions)
+        if isinstance(trained.config.text, WordsConfig):
+            met = words_of(captions)  # and so trained from now on
             left = tuple(word for word in trained.config.text.untrained if word not in met)
             trained.text.config = replace(trained.config.text, untrained=left)
             trained.config = replace(trained.config, text=trained.text.config)
@@ -329,25 +319,6 @@ def content_units(model: TextOCVP, batches: SlotBatches, *, keep: bool) -> Tenso
     return model.predictor.content_std_C
 
 
-def held_out_figures(
-    model: TextOCVP, held_out: Episodes, slots_ETKD: Tensor, slots: FrameCache
-) -> tuple[Callable[[int | None], InstructionFollowing | SlotErrors], str]:
-    """How to measure the first so many held-out episodes, and the name of the file for the final figures."""
-    layout = model.config.parser.layout
-    left_out = "slots have no explicit places: no instruction following"
-    if layout.explicit:
-        trials = find_trials(held_out, slots, layout)
-        if trials.original:
-            return lambda count: evaluate_following(
-                model, slots_ETKD, trials, layout, count
-            ), "following.json"
-        left_out = "the held-out episodes have no masks and questions: no instruction following"
-    sentences = held_out.instructions
-    return lambda count: evaluate_slots(
-        model, slots_ETKD, sentences, layout, left_out, count
-    ), "slot_errors.json"
-
-
 def drawn_loss(model: TextOCVP, episodes: Episodes, batch: StepBatch, predicted_BSKD: Tensor) -> Tensor:
     """Mean squared error of the frames that `batch` wants drawn; its gradient flows through the frozen renderer."""
     chosen_BF = torch.from_numpy(batch.drawn_BF).to(predicted_BSKD.device)
@@ -357,34 +328,11 @@ def drawn_loss(model: TextOCVP, episodes: Episodes, batch: StepBatch, predicted_
     return (frames - true_BF3HW.to(frames.device).flatten(0, 1)).square().mean()
 
 
-def with_longer_window(predictor: SlotPredictor, window: int) -> SlotPredictor:
-    """A copy that takes up to `window` frames. Within the old window it predicts what the original does.
+def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
+    """Let the predictor take more frames, as `predictor.window=FRAMES` says; within the old window it stays as it is.
 
     The learned time codes of the new frames start as copies of the last one that training reached, so that the first
     guess for frame 25 is what was learned about frame 24.
-
-    Raises:
-        ValueError: if the window would become shorter.
-    """
-    config = predictor.config
-    if window < config.window:
-        raise ValueError(
-            f"the window can grow, not shrink: it is {config.window} frames, {window} were asked for"
-        )
-    grown = copy.deepcopy(predictor)
-    grown.config = replace(config, window=window)
-    rows = window + (config.attention == "window")
-    if config.age_encoding == "learned":
-        # The published form has one code more than its window has frames: no training ever reached that one.
-        reached = predictor.ages.detach()[: config.window]
-        grown.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(rows - config.window, -1)]))
-    else:
-        grown.register_buffer("ages", sinusoids(rows, config.dim).to(predictor.ages.device), persistent=False)
-    return grown
-
-
-def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
-    """Change the trained model as `settings` say, which may be `predictor.window=FRAMES` only.
 
     Raises:
         ValueError: if a setting is another one, makes no sense, or would shorten the window.
@@ -395,6 +343,18 @@ def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
             raise ValueError(
                 f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow"
             )
-    config = with_settings(model.config, settings)
-    model.predictor = with_longer_window(model.predictor, config.predictor.window)
-    model.config = config
+    config, predictor = with_settings(model.config, settings), model.predictor
+    old, new = model.config.predictor, config.predictor
+    if new.window < old.window:
+        raise ValueError(
+            f"the window can grow, not shrink: it is {old.window} frames, {new.window} were asked for"
+        )
+    model.config, predictor.config = config, new
+    rows = new.window + (new.attention == "window")
+    if new.age_encoding == "learned":
+        # The published form has one code more than its window has frames: no training ever reached that one.
+        reached = predictor.ages.detach()[: old.window]
+        predictor.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(rows - old.window, -1)]))
+    else:
+        codes = sinusoids(rows, new.dim).to(predictor.ages.device)
+        predictor.register_buffer("ages", codes, persistent=False)

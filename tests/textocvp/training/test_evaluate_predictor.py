@@ -16,12 +16,9 @@ from textocvp.data.episodes import EpisodeFile, Question
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.training.evaluate_predictor import (
     PIXEL,
+    HeldOut,
     Trial,
     Trials,
-    add_trials,
-    evaluate_following,
-    evaluate_slots,
-    find_trials,
     place_and_size,
     slot_at,
 )
@@ -54,9 +51,13 @@ class _Obedient(torch.nn.Module):
         return Imagined(slots)
 
 
+def held_out(slots: torch.Tensor, trials: Trials, layout: SlotLayout = LAYOUT) -> HeldOut:
+    return HeldOut(slots, ("a sentence",) * len(slots), layout, trials)
+
+
 def asked(questions: list[Question], slot_of: dict[int, int]) -> Trials:
-    trials = Trials([], [], [])
-    add_trials(trials, 0, questions[0], questions, slot_of, np.random.default_rng(0))
+    trials = Trials()
+    trials.add(0, questions[0], questions, slot_of, np.random.default_rng(0))
     return trials
 
 
@@ -70,17 +71,16 @@ def test_trials_ask_and_judge() -> None:
         Trial(0, GREEN.text, 1, 3)
     ]
     assert trials.wrong_text == [Trial(0, GREEN.text, 1, 2)]
-    model = _Obedient({BLUE.text: (1, 2), GREEN.text: (1, 3)})
-    obedient = evaluate_following(model, slots, trials, LAYOUT)
+    held, model = held_out(slots, trials), _Obedient({BLUE.text: (1, 2), GREEN.text: (1, 3)})
+    obedient = held.measure(model)
     assert model.training
     assert (obedient.original, obedient.other_target, obedient.wrong_text, obedient.grounded) == (1, 1, 0, 1)
-    deaf = evaluate_following(_Obedient({BLUE.text: (1, 2), GREEN.text: (1, 2)}), slots, trials, LAYOUT)
+    deaf = held.measure(_Obedient({BLUE.text: (1, 2), GREEN.text: (1, 2)}))
     assert (deaf.original, deaf.other_target, deaf.wrong_text) == (1, 0, 1)
 
-    lost = asked([BLUE, GREEN], {7: -1, 8: 2, 9: 3})
-    nobody = evaluate_following(model, slots, lost, LAYOUT)
+    nobody = held_out(slots, asked([BLUE, GREEN], {7: -1, 8: 2, 9: 3})).measure(model)
     assert (nobody.original, nobody.grounded, nobody.episodes) == (0, 0, 1) and np.isnan(nobody.error_px)
-    assert evaluate_following(model, slots, trials, LAYOUT, episodes=0).episodes == 0
+    assert held.measure(model, 0).episodes == 0
     assert asked([BLUE], {7: 1, 8: 2}).wrong_text == []  # there is nothing else to ask
 
 
@@ -111,7 +111,7 @@ def test_questions_come_from_the_file(tmp_path: Path, version: int) -> None:
     model = build(PLACED)
     with EpisodeFile(path) as episodes:
         slots = cached_slots(model, episodes, tmp_path / "slots")
-        trials = find_trials(episodes, slots, model.config.parser.layout)
+        trials = HeldOut.of(episodes, slots, model.config.parser.layout, 6).trials
         questions = [set(q.text for q in episodes.truth(index).questions) for index in range(2)]
     assert [trial.text for trial in trials.original] == list(episodes.instructions)
     assert [trial.episode for trial in trials.other_target] == [0, 1]
@@ -123,7 +123,8 @@ def test_nothing_is_asked_without_masks(tmp_path: Path) -> None:
     model = build(PLACED)
     with EpisodeFile(write_toy_episodes(tmp_path / "toy.h5", [6], truth=False)) as episodes:
         slots = cached_slots(model, episodes, tmp_path / "slots")
-        assert find_trials(episodes, slots, model.config.parser.layout) == Trials([], [], [])
+        held = HeldOut.of(episodes, slots, model.config.parser.layout, 6)
+    assert held.trials == Trials() and held.file == "slot_errors.json"
 
 
 class _Still(_Obedient):
@@ -136,22 +137,16 @@ class _Still(_Obedient):
 
 
 def test_slot_errors_are_those_of_what_moves() -> None:
-    slots, texts = true_slots(6), ["a sentence"] * 12
-    found = evaluate_slots(_Still({}), slots, texts, LAYOUT, "why", episodes=5)
+    slots = true_slots(6)
+    found = held_out(slots, Trials()).measure(_Still({}), 5)
     # Slot 1 moves by 0.05 a frame: 0.15 from where it began, on average over five frames.
     assert found.error.value == pytest.approx(0.15 / PIXEL, rel=1e-2) and found.error == found.still_error
-    assert (
-        found.error.n == 5
-        and found.left_out == "why"
-        and set(found.as_metrics())
-        == {
-            "val/error",
-            "val/still_error",
-        }
-    )
-    unmoved = evaluate_slots(_Still({}), slots[:, :1].expand(-1, 6, -1, -1), texts, LAYOUT, "why")
+    assert found.error.n == 5 and "no masks and questions" in found.left_out
+    assert set(found.as_metrics()) == {"val/error", "val/still_error"}
+    unmoved = held_out(slots[:, :1].expand(-1, 6, -1, -1), Trials()).measure(_Still({}))
     assert unmoved.error is None and unmoved.as_metrics() == {}
     plain = SlotLayout(content=LAYOUT.dim, explicit=False)
-    whole = evaluate_slots(_Still({}), slots, texts, plain, "why")
+    whole = held_out(slots, Trials(), plain).measure(_Still({}))
     expected = (slots[:, :1] - slots[:, 1:]).square().mean(dim=(1, 2, 3)).sqrt().mean()
     assert whole.error.value == pytest.approx(float(expected), rel=1e-5)
+    assert "no explicit places" in whole.left_out
