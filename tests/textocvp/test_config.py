@@ -11,6 +11,7 @@ from textocvp.baselines.mage.config import MAGE_PRESETS
 from textocvp.config import ModelConfig, with_settings
 from textocvp.parsers.savi import SaviConfig
 from textocvp.presets import PRESETS, preset
+from textocvp.renderers.patches import PatchConfig
 from textocvp.slots import SlotLayout
 
 
@@ -48,11 +49,7 @@ def test_a_kind_is_changed_first_and_keeps_what_both_kinds_have() -> None:
     assert config.parser == SaviConfig(
         num_slots=9, layout=SlotLayout(content=64, explicit=False), iterations_first=3
     )
-    assert (
-        config.renderer.to_dict()
-        if hasattr(config.renderer, "to_dict")
-        else config.renderer.kind == "patches"
-    )
+    assert config.renderer == PatchConfig(hidden=256)  # as wide as the glimpse renderer's
     with pytest.raises(ValueError, match=r"'savi' needs parser\.layout\.explicit = false"):
         with_settings(preset("tabletop-small"), ["parser.kind=savi"])
 

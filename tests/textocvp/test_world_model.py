@@ -48,7 +48,7 @@ def test_the_same_seed_gives_the_same_rollout(world_model: WorldModel, scene: np
     torch.manual_seed(2)
     b = world_model.rollout(scene, TEXT, horizon=3, seed=5)
     assert torch.equal(a.slots, b.slots)
-    if world_model.model.config.parser.initializer == "gaussian":
+    if world_model.model.config.parser.kind == "savi":
         assert not torch.allclose(
             a.slots, world_model.rollout(scene, TEXT, horizon=3, seed=6).slots, atol=1e-3
         )

@@ -119,7 +119,7 @@ def test_nothing_is_made_up_where_weights_are_missing_or_wrong(folder: Path, tmp
         encoder(folder)(frames)
     save_file(tensors, weights)
     config.write_text(json.dumps({**settings, "model_type": "vit"}))
-    with pytest.raises(WeightsError, match="reads models of the type 'dinov2', .* is of the type 'vit'"):
+    with pytest.raises(WeightsError, match=r"reads models of the type 'dinov2', .* is of the type 'vit'"):
         encoder(folder)(frames)
     config.unlink()
     with pytest.raises(WeightsError, match=r"lacks config\.json"):
