@@ -97,14 +97,13 @@ def measure_parser(
         if slots.shape[1] == 1:
             continue
         labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
-        # The arm (1) is not an object: as background it matches nothing.
-        objects = np.where(episode.segmentation == 1, 0, episode.segmentation)
+        truth, objects = episode.segmentation, range(2, 2 + len(episode.objects))
         times = range(0, len(labels), frame_step)
-        matches = np.concatenate([object_ious(labels[t], objects[t]).ious for t in times])
+        matches = np.concatenate([object_ious(labels[t], truth[t], objects).ious for t in times])
         ious.append(matches.mean())
         found.append((matches > 0.5).mean())
-        follows.append(followed(labels, objects).mean())
-        aris.append(np.mean([foreground_ari(labels[t], episode.segmentation[t]) for t in times]))
+        follows.append(followed(labels, truth, objects).mean())
+        aris.append(np.mean([foreground_ari(labels[t], truth[t]) for t in times]))
     miou, share, kept, ari = (
         bootstrap_interval(values) if values else None for values in (ious, found, follows, aris)
     )
