@@ -1,1 +1,9 @@
-"""Models that TextOCVP is compared with and that are no TextOCVP themselves."""
+"""Models that TextOCVP is compared with and that are no TextOCVP themselves: one folder each, and the table of them.
+
+A class here is a `textocvp.protocols.VideoModel` with a class method `from_folder(folder, name, device)`.
+"""
+
+from textocvp.baselines.mage import MageVideoModel
+
+BASELINES = {"mage": MageVideoModel}
+"""What `architecture` says in the `config.json` of a checkpoint -> the class that loads it."""

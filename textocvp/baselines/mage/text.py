@@ -6,24 +6,54 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.baselines.mage.attention import BiasedAttention, FeedForward
-from textocvp.baselines.mage.config import PublishedTextConfig
+from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
 from textocvp.config import TextConfig
-from textocvp.layers import MASKED
+from textocvp.predictors.base import mask_bias
 from textocvp.text import build_text_encoder
 from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
 from textocvp.text.words import GRAMMAR, TRAIN_COLORS
 
-WORDS = ("<pad>", "<unk>", *GRAMMAR, *TRAIN_COLORS)
-"""Row by row; the order is part of every checkpoint: append."""
-PAD, UNKNOWN = 0, 1
+SPECIAL = ("<pad>", "<unk>")
+PAD, UNKNOWN = range(2)
 
 _WORD = re.compile(r"[a-z0-9']+")
+
+
+@dataclass(frozen=True)
+class PublishedTextConfig:
+    """Words to tokens with a transformer from scratch.
+
+    Attributes:
+        kind: always `published`; tells this from the encoders of `textocvp.text`.
+        dim: token width.
+        layers: of the transformer.
+        heads: of its attention.
+        hidden: width of its feed-forward nets.
+        max_tokens: longest sentence in words; a longer one is an error.
+        vocabulary: words with an embedding each, in the order of its rows, after the special tokens.
+        rows: of the word embedding. Published are more than there are words; the rest is never used.
+    """
+
+    kind: Literal["published"] = "published"
+    dim: int = 512
+    layers: int = 2
+    heads: int = 16
+    hidden: int = 2048
+    max_tokens: int = 32
+    vocabulary: tuple[str, ...] = GRAMMAR + TRAIN_COLORS
+    rows: int = 30
+
+    def __post_init__(self) -> None:
+        wanted = len(SPECIAL) + len(self.vocabulary)
+        if self.rows < wanted:
+            raise ValueError(f"text.rows must be at least {wanted} for this text.vocabulary, not {self.rows}")
 
 
 class _PostNormBlock(nn.Module):
@@ -40,22 +70,16 @@ class _PostNormBlock(nn.Module):
 
 
 class PublishedText(TextEncoder):
-    """Words to tokens. Padding is masked, so what a sentence means does not depend on its neighbours in the batch.
-
-    Raises:
-        ValueError: if the embedding has fewer rows than there are words.
-    """
+    """Words to tokens. Padding is masked, so what a sentence means does not depend on its neighbours in the batch."""
 
     pad = PAD
     config: PublishedTextConfig  # type: ignore[assignment]
 
     def __init__(self, config: PublishedTextConfig) -> None:
         super().__init__()
-        if config.vocabulary < len(WORDS):
-            raise ValueError(f"text.vocabulary must be at least {len(WORDS)}, not {config.vocabulary}")
         self.config = config
-        self._numbers = {word: row for row, word in enumerate(WORDS)}
-        self.embedding = nn.Embedding(config.vocabulary, config.dim, padding_idx=PAD)
+        self._numbers = {word: row for row, word in enumerate((*SPECIAL, *config.vocabulary))}
+        self.embedding = nn.Embedding(config.rows, config.dim, padding_idx=PAD)
         self.positions_LC = nn.Parameter(torch.empty(config.max_tokens, config.dim))
         for weight in (self.embedding.weight, self.positions_LC):
             nn.init.normal_(weight, std=0.02)
@@ -85,7 +109,7 @@ class PublishedText(TextEncoder):
         length = mask_BL.shape[1]
         self._check_length(length, "this batch")
         x_BLC = self.norm_words(self.embedding(words.ids_BL) + self.positions_LC[:length])
-        bias_B11L = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, MASKED)[:, None, None]
+        bias_B11L = mask_bias(~mask_BL)[:, None, None]
         for block in self.blocks:
             x_BLC = block(x_BLC, bias_B11L)
         x_BLC = self.project(self.norm(x_BLC)) * mask_BL[..., None]
