@@ -12,9 +12,8 @@ from typing import Literal
 import torch
 from torch import nn
 
-from textocvp.baselines.mage.config import ARCHITECTURE as MAGE
-from textocvp.baselines.mage.config import MAGE_PRESETS, MageConfig
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS, Mage, MageConfig
+from textocvp.baselines.mage.model import ARCHITECTURE as MAGE
 from textocvp.checkpoint import (
     DEFAULT_CHECKPOINT,
     bundled_checkpoints,

@@ -126,11 +126,9 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load and that the other commands
     # never use.
-    from textocvp.baselines.mage import train_mage, train_vqvae
-    from textocvp.baselines.mage.config import mage_preset
-    from textocvp.data.episodes import EpisodeFile
-    from textocvp.data.feature_cache import FeatureCacheError
-    from textocvp.data.slot_cache import SlotCacheError
+    from textocvp.baselines.mage import mage_preset, train_mage, train_vqvae
+    from textocvp.data.cache import CacheError
+    from textocvp.data.episodes import open_episodes
     from textocvp.parsers.dino import DinoWeightsError
     from textocvp.text.pretrained import TextWeightsError
     from textocvp.training import parser as train_parser
@@ -156,8 +154,8 @@ def _train(arguments: list[str]) -> None:
         if chosen.preset is not None:
             of_mage = isinstance(chosen, (train_vqvae.VQVAETraining, train_mage.MageTraining))
             with_settings((mage_preset if of_mage else preset)(chosen.preset), chosen.set)
-        EpisodeFile(chosen.data, first=chosen.episodes).close()
-        EpisodeFile(chosen.val).close()
+        open_episodes(chosen.data, chosen.episodes).close()
+        open_episodes(chosen.val).close()
     except KeyError as error:
         raise Mistake(error.args[0]) from error
     except (OSError, ValueError) as error:
@@ -170,13 +168,7 @@ def _train(arguments: list[str]) -> None:
     }
     try:
         train[type(chosen)](chosen)
-    except (
-        SettingsError,
-        SlotCacheError,
-        FeatureCacheError,
-        DinoWeightsError,
-        TextWeightsError,
-    ) as error:
+    except (SettingsError, CacheError, DinoWeightsError, TextWeightsError) as error:
         raise Mistake(str(error)) from error
 
 

@@ -1,4 +1,4 @@
-"""What the parser is trained for (stage 1). The predictor's losses live beside its loop."""
+"""What the parser (stage 1) and the predictor (stage 2) are trained for."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ParserLoss:
             self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
         )
 
-    def figures(self) -> dict[str, Tensor]:
+    def as_metrics(self) -> dict[str, Tensor]:
         """The terms, named for a log."""
         return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
 
@@ -123,7 +123,7 @@ class SlotLoss:
         """The weighted sum that is minimised."""
         return self.position + scale_weight * self.scale + content_weight * self.content
 
-    def figures(self) -> dict[str, Tensor]:
+    def as_metrics(self) -> dict[str, Tensor]:
         """The terms, named for a log."""
         return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
 
