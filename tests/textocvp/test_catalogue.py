@@ -8,8 +8,8 @@ import pytest
 
 from tests.textocvp.conftest import PLACED
 from textocvp import catalogue as module
-from textocvp.baselines.mage.config import MAGE_PRESETS
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS
+from textocvp.baselines.mage import Mage
 from textocvp.catalogue import Entry, catalogue
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS

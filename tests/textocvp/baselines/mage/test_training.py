@@ -1,4 +1,4 @@
-"""Training MAGE: both stages continue exactly, the codebook is put to use, and nothing trains on what does not fit."""
+"""Training MAGE: both stages continue exactly, codes are kept, and nothing trains on what does not fit."""
 
 from __future__ import annotations
 
@@ -10,19 +10,16 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.textocvp.both_stages import MAGE
+from tests.textocvp.baselines.mage.conftest import TINY
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.baselines.mage import train_mage, train_vqvae
-from textocvp.baselines.mage.checkpoint import load_vqvae
-from textocvp.baselines.mage.codes import CodeCache, CodeCacheError, cached_codes
-from textocvp.baselines.mage.config import MAGE_PRESETS
-from textocvp.baselines.mage.model import Mage
-from textocvp.baselines.mage.train_mage import MageTraining
+from textocvp.baselines.mage import MAGE_PRESETS, Mage, train_mage, train_vqvae
+from textocvp.baselines.mage.train_mage import MageTraining, cached_codes
 from textocvp.baselines.mage.train_vqvae import VQVAETraining
-from textocvp.baselines.mage.vqvae import VQVAE, Codebook, perplexity
+from textocvp.baselines.mage.vqvae import VQVAE, load_vqvae
 from textocvp.checkpoint import CheckpointError
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data.cache import CacheError
+from textocvp.data.episodes import open_episodes
 from textocvp.training import run as training
 from textocvp.training.run import SettingsError
 
@@ -32,17 +29,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Toy episodes; the tiny preset is known by name."""
     write_toy_episodes(tmp_path / "train.h5", [9, 8, 9, 9])
     write_toy_episodes(tmp_path / "val.h5", [9, 8], seed=1)
-    monkeypatch.setitem(MAGE_PRESETS, MAGE.name, MAGE)
+    monkeypatch.setitem(MAGE_PRESETS, TINY.name, TINY)
     return tmp_path
 
 
 def first_stage(folder: Path, out: str, **changes) -> VQVAETraining:
-    settings = dict(preset=MAGE.name, steps=4, batch=3, stride=2, warmup=1, restart_every=1) | changes
+    settings = dict(preset=TINY.name, steps=4, batch=3, stride=2, warmup=1, restart_every=1) | changes
     return VQVAETraining(folder / "train.h5", folder / "val.h5", folder / out, **settings)
 
 
 def second_stage(folder: Path, out: str, **changes) -> MageTraining:
-    settings = dict(preset=MAGE.name, steps=4, batch=3, warmup=1, autoregressive=0.5) | changes
+    settings = dict(preset=TINY.name, steps=4, batch=3, warmup=1, autoregressive=0.5) | changes
     vqvae = folder / "vqvae" / "checkpoint"
     return MageTraining(folder / "train.h5", folder / "val.h5", folder / out, vqvae=vqvae, **settings)
 
@@ -65,9 +62,8 @@ def stopped_after_two(train, args, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_killed_run_of_either_stage_continues_exactly(folder: Path, monkeypatch) -> None:
     train_vqvae.train(first_stage(folder, "vqvae"))
     resumed = first_stage(folder, "vqvae-resumed", save_minutes=0.0, restart_every=3)
-    straight = first_stage(
-        folder, "vqvae-straight", restart_every=3
-    )  # uses are counted across the interruption
+    # Every third step, so that uses are counted across the interruption.
+    straight = first_stage(folder, "vqvae-straight", restart_every=3)
     train_vqvae.train(straight)
     stopped_after_two(train_vqvae.train, resumed, monkeypatch)
     train_vqvae.train(resumed)
@@ -92,27 +88,21 @@ def same_weights(one: Path, other: Path) -> None:
 
 def test_codes_are_kept_for_the_vqvae_that_made_them(folder: Path) -> None:
     torch.manual_seed(0)
-    one, other = VQVAE(MAGE.vqvae).eval(), VQVAE(MAGE.vqvae).eval()
-    with EpisodeFile(folder / "train.h5") as episodes, EpisodeFile(folder / "val.h5") as others:
-        cache = cached_codes(one, episodes, folder / "codes.h5")
-        again = cached_codes(one, episodes, folder / "codes.h5")
-        assert np.array_equal(cache.codes_Nhw, again.codes_Nhw) and len(again) == 4
-        frames = torch.from_numpy(episodes.episode(1).frames).permute(0, 3, 1, 2).float() / 127.5 - 1
-        with torch.no_grad():
-            assert np.array_equal(again.codes_Nhw[9:17], one.encode(frames).numpy())
-        with pytest.raises(CodeCacheError, match="other vqvae"):
-            cached_codes(other, episodes, folder / "codes.h5")
-        with pytest.raises(CodeCacheError, match="other episodes"):
-            cached_codes(one, others, folder / "codes.h5")
-        (folder / "codes.h5").write_bytes(b"no HDF5")
-        with pytest.raises(CodeCacheError, match="damaged"):
-            cached_codes(one, episodes, folder / "codes.h5")
-
-
-def test_an_episode_that_has_ended_stays_as_it_is() -> None:
-    cache = CodeCache(np.arange(5, dtype=np.uint16)[:, None, None], np.array([0, 3, 5]))
-    clips = cache.clips(np.array([0, 1]), np.arange(4))
-    assert clips[:, :, 0, 0].tolist() == [[0, 1, 2, 2], [3, 4, 4, 4]]
+    one, other = VQVAE(TINY.vqvae).eval(), VQVAE(TINY.vqvae).eval()
+    with open_episodes(folder / "train.h5") as episodes, open_episodes(folder / "val.h5") as others:
+        cache = cached_codes(one, episodes, folder / "codes")
+        again = cached_codes(one, episodes, folder / "codes")
+        assert np.array_equal(cache.values, again.values) and len(again) == 4
+        frames = torch.from_numpy(episodes.frames(1)).permute(0, 3, 1, 2).float() / 127.5 - 1
+        assert np.array_equal(again.episode(1), one.encode(frames).numpy())
+        for made_from, vqvae, data in (("network", other, episodes), ("episodes", one, others)):
+            with pytest.raises(CacheError, match=f"other {made_from}"):
+                cached_codes(vqvae, data, folder / "codes")
+        part = folder / "codes" / "000000.h5"
+        part.unlink()  # HDF5 would go on with the file that it has open
+        part.write_bytes(b"no HDF5")
+        with pytest.raises(CacheError, match="damaged"):
+            cached_codes(one, episodes, folder / "codes")
 
 
 def test_what_does_not_fit_is_refused_by_name(folder: Path) -> None:
@@ -127,34 +117,17 @@ def test_what_does_not_fit_is_refused_by_name(folder: Path) -> None:
         Mage.load(folder / "vqvae" / "checkpoint")
 
 
-def test_unused_codes_move_to_where_features_are_and_used_ones_stay() -> None:
-    torch.manual_seed(0)
-    codebook = Codebook(4, 2)
-    before = codebook.codes_KC.detach().clone()
-    features = torch.tensor([[5.0, 5.0], [6.0, 6.0], [-7.0, 2.0]])
-    unused = torch.tensor([False, True, False, True])
-    assert codebook.restart(unused, features, torch.Generator().manual_seed(0)) == 2
-    assert torch.equal(codebook.codes_KC[~unused], before[~unused])
-    assert all((features == code).all(dim=1).any() for code in codebook.codes_KC[unused])
-    assert codebook.restart(torch.zeros(4, dtype=torch.bool), features, torch.Generator()) == 0
-
-
-def test_perplexity_counts_codes_that_are_used_equally() -> None:
-    assert perplexity(torch.tensor([3, 3, 0, 3, 3])) == pytest.approx(4)
-    assert perplexity(torch.tensor([0, 9, 0])) == pytest.approx(1)
-
-
 def test_mage_dino_trains_from_its_features_and_keeps_them_frozen(folder: Path) -> None:
     weights = write_tiny_dino(folder / "dino")
     vqvae = replace(
-        MAGE.vqvae,
+        TINY.vqvae,
         encoder="dinov2",
         channels=32,
         encoder_weights=str(weights),
         encoder_dim=DIM,
         encoder_patch=PATCH,
     )
-    MAGE_PRESETS[MAGE.name] = replace(MAGE, vqvae=vqvae)  # the fixture puts the old one back
+    MAGE_PRESETS[TINY.name] = replace(TINY, vqvae=vqvae)  # the fixture puts the old one back
     cached = first_stage(folder, "vqvae", steps=2, cache_features=True)
     train_vqvae.train(cached)
     train_vqvae.train(first_stage(folder, "plain", steps=2))
@@ -169,22 +142,3 @@ def test_mage_dino_trains_from_its_features_and_keeps_them_frozen(folder: Path) 
     moved = VQVAE(replace(model.config, encoder_weights=str(other)))
     with pytest.raises(ValueError, match=r"vqvae\.encoder_fingerprint"):
         moved.encode(torch.zeros(1, 3, 32, 32))
-
-
-def test_copying_only_adds_to_codes_that_were_seen() -> None:
-    torch.manual_seed(0)
-    assert Mage(MAGE).axial.keep is None
-    model = Mage(replace(MAGE, axial=replace(MAGE.axial, copy=True))).eval()
-    seen = torch.tensor([2, 7])[None, :, None, None].expand(1, 2, 8, 8)  # code 2 everywhere, then code 7
-    text = model.text(["put the red block in the blue bowl"])
-    assert model.axial.keep is not None
-    with torch.no_grad():
-        model.axial.keep.weight.zero_()
-        model.axial.keep.bias.zero_()
-        before = model.axial(seen, text, torch.ones(1))
-        model.axial.keep.bias.copy_(torch.tensor([3.0, 5.0]))  # as it is now, as it was first
-        added = model.axial(seen, text, torch.ones(1)) - before
-    expected = torch.zeros_like(added)
-    expected[:, 0, ..., 2] = 3 + 5
-    expected[:, 1, ..., 7], expected[:, 1, ..., 2] = 3, 5
-    torch.testing.assert_close(added, expected, atol=1e-5, rtol=0)
