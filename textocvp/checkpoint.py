@@ -1,17 +1,15 @@
-"""TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
+"""Checkpoints: a folder with `config.json` and `model.safetensors` (every tensor of the model, and no other).
 
-A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the
-model, and no other). Frozen pretrained encoders, of text and of images, are not in it: `config.json` has
-their names and fingerprints. Of a fine-tuned one the folder `text` holds architecture and tokenizer. Loading
-is strict: a checkpoint that does not fit is an error that names the field or the tensor. Nothing is ever
-unpickled.
+Frozen pretrained encoders, of text and of images, are not in it: `config.json` has their names and fingerprints. Of a
+fine-tuned one the folder `text` holds architecture and tokenizer. Loading is strict: what does not fit is an error that
+names the field or the tensor. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -21,7 +19,7 @@ from typing import Any
 import torch
 from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from textocvp.config import ModelConfig
@@ -29,33 +27,95 @@ from textocvp.config import ModelConfig
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 TEXT_FOLDER = "text"  # only where a fine-tuned text encoder needs it
+DEFAULT_CHECKPOINT = "tabletop-small"
 
 
 class CheckpointError(ValueError):
     """A checkpoint is missing, damaged, or made for another model; the message says which part and why."""
 
 
-def checkpoint_folder(name: str | Path, **hub: Any) -> Path:
-    """The folder of that name, or the one into which the repository `name` of the Hugging Face hub was fetched.
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where a model came from.
+
+    Attributes:
+        name: the bundled name, the folder or the hub id that was asked for.
+        sha256: of its `model.safetensors`; empty for a model that was never saved.
+    """
+
+    name: str
+    sha256: str = ""
+
+    @classmethod
+    def of(cls, folder: Path, name: str) -> Checkpoint:
+        """The checkpoint in `folder`, found under `name`."""
+        return cls(name, hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest())
+
+
+def bundled_checkpoints() -> list[str]:
+    """Names of the checkpoints that come with the package."""
+    root = files("textocvp") / "checkpoints"
+    if not root.is_dir():
+        return []
+    return sorted(folder.name for folder in root.iterdir() if (folder / CONFIG_FILE).is_file())
+
+
+@contextmanager
+def resolve_checkpoint(name: str | Path, **hub: Any) -> Iterator[Path]:
+    """The folder of a checkpoint, for as long as the context lasts.
 
     Args:
+        name: a bundled name, else a folder, else the id `owner/name` of a repository on the Hugging Face hub.
         hub: as in `huggingface_hub.snapshot_download`.
 
     Raises:
-        CheckpointError: if there is neither.
+        CheckpointError: if there is none of these; the message lists the bundled ones.
     """
-    folder = Path(name)
-    if folder.is_dir():
-        return folder
+    name, bundled = str(name), bundled_checkpoints()
+    if name in bundled:
+        with as_file(files("textocvp") / "checkpoints" / name) as folder:
+            yield folder
+        return
+    if Path(name).is_dir():
+        yield Path(name)
+        return
+    allowed = (
+        f"Bundled checkpoints: {', '.join(bundled) or 'none'}. Else give a folder that contains {CONFIG_FILE} and "
+        f"{WEIGHTS_FILE}, or the id owner/name of a repository on the Hugging Face hub that does."
+    )
+    if name.count("/") != 1 or name.startswith((".", "/", "~")):
+        raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
     try:
-        patterns = [CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"]
-        return Path(snapshot_download(str(name), allow_patterns=patterns, **hub))
+        fetched = snapshot_download(
+            name, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"], **hub
+        )
     # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
     except Exception as error:
         raise CheckpointError(
-            f"{str(name)!r} is no folder here, and fetching it from the Hugging Face hub failed: "
-            f"{type(error).__name__}: {error}"
+            f"unknown checkpoint {name!r}: it is no folder here, and fetching it from the Hugging Face hub failed: "
+            f"{type(error).__name__}: {error}. {allowed}"
         ) from error
+    yield Path(fetched)
+
+
+def read_json(folder: Path) -> dict[str, Any]:
+    """What `config.json` of the checkpoint in `folder` holds, whatever its architecture.
+
+    Raises:
+        CheckpointError: if there is no readable `config.json` there.
+    """
+    path = folder / CONFIG_FILE
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and {WEIGHTS_FILE}"
+        ) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from error
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path} is damaged: it must hold one JSON object, not a {type(data).__name__}")
+    return data
 
 
 def read_config(folder: Path) -> ModelConfig:
@@ -63,7 +123,7 @@ def read_config(folder: Path) -> ModelConfig:
 
     Raises:
         CheckpointError: if there is no readable `config.json` there, it is of another architecture, or a field is
-            unknown or missing.
+            unknown, missing or has a value that is not allowed.
     """
     data = read_json(folder)
     if data.get("architecture") == "mage-vqvae":
@@ -80,27 +140,6 @@ def read_config(folder: Path) -> ModelConfig:
         return ModelConfig.from_dict(data)
     except ValueError as error:
         raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-
-
-def read_json(folder: Path) -> dict[str, Any]:
-    """What `config.json` of the checkpoint in `folder` holds, whatever its architecture.
-
-    Raises:
-        CheckpointError: if there is no readable `config.json` there.
-    """
-    path = folder / CONFIG_FILE
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"{folder} is no checkpoint: there is no {CONFIG_FILE}; it must contain {CONFIG_FILE} and "
-            f"{WEIGHTS_FILE}"
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from error
-    if not isinstance(data, dict):
-        raise CheckpointError(f"{path} is damaged: it must hold one JSON object, not a {type(data).__name__}")
-    return data
 
 
 def load_weights(model: nn.Module, path: Path) -> None:
@@ -131,6 +170,17 @@ def load_weights(model: nn.Module, path: Path) -> None:
     model.load_state_dict(found, strict=True)
 
 
+def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) -> None:
+    """Write `config.json` and `model.safetensors` into `folder`, which is made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
+    tensors = {
+        name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()
+    }
+    save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
+    (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+
+
 def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:
     # Weights may be stored in a shorter float; integers and floats must not be mixed up.
     return tensor.shape, tensor.is_floating_point()
@@ -143,63 +193,3 @@ def _described(tensor: Tensor) -> str:
 def _listed(names: list[str], most: int = 5) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"tensor{'s' if len(names) > 1 else ''} {', '.join(map(repr, names[:most]))}{more}"
-
-
-DEFAULT_CHECKPOINT = "tabletop-small"
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Where a model came from.
-
-    Attributes:
-        name: the bundled name, the folder or the hub id that was asked for.
-        sha256: of its `model.safetensors`; empty for a model that was never saved.
-    """
-
-    name: str
-    sha256: str = ""
-
-    @classmethod
-    def of(cls, folder: Path, name: str) -> Checkpoint:
-        """The checkpoint in `folder`, found under `name`."""
-        return cls(name, hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest())
-
-
-def bundled_checkpoints() -> list[str]:
-    """Names of the checkpoints that come with the package."""
-    root = files("textocvp") / "checkpoints"
-    if not root.is_dir():
-        return []
-    return sorted(folder.name for folder in root.iterdir() if (folder / CONFIG_FILE).is_file())
-
-
-@contextmanager
-def resolve_checkpoint(name: str) -> Iterator[Path]:
-    """The folder of a checkpoint, for as long as the context lasts.
-
-    Args:
-        name: a bundled name, else a folder, else the id `owner/name` of a repository on the Hugging Face hub.
-
-    Raises:
-        CheckpointError: if there is none of these; the message lists the bundled ones.
-    """
-    if name in bundled_checkpoints():
-        with as_file(files("textocvp") / "checkpoints" / name) as folder:
-            yield folder
-        return
-    if Path(name).is_dir():
-        yield Path(name)
-        return
-    bundled = ", ".join(bundled_checkpoints()) or "none"
-    allowed = (
-        f"Bundled checkpoints: {bundled}. Else give a folder that contains {CONFIG_FILE} and {WEIGHTS_FILE}, or the "
-        "id owner/name of a repository on the Hugging Face hub that does."
-    )
-    if name.count("/") != 1 or name.startswith((".", "/", "~")):
-        raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
-    try:
-        fetched = checkpoint_folder(name)
-    except CheckpointError as error:
-        raise CheckpointError(f"unknown checkpoint {name!r}: {error}. {allowed}") from error
-    yield fetched

@@ -7,21 +7,36 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import numpy as np
+import torch
 import tyro
 from PIL import Image, UnidentifiedImageError
 from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.checkpoint import CONFIG_FILE, CheckpointError
-from textocvp.config import with_settings
+from textocvp.baselines.mage import MAGE_PRESETS, Mage, MageConfig, mage_preset
+from textocvp.baselines.mage.model import ARCHITECTURE as MAGE
+from textocvp.checkpoint import (
+    CONFIG_FILE,
+    DEFAULT_CHECKPOINT,
+    CheckpointError,
+    bundled_checkpoints,
+    read_config,
+    read_json,
+    resolve_checkpoint,
+)
+from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
-from textocvp.presets import preset
+from textocvp.model import TextOCVP
+from textocvp.parsers.dino import DINO_HUB_ID
+from textocvp.presets import DESCRIPTIONS, PRESETS, preset
+from textocvp.pretrained import WeightsError
 from textocvp.protocols import load_model
-from textocvp.world_model import DEFAULT_CHECKPOINT, WorldModel
+from textocvp.text.pretrained import MINILM_PACKAGE, T5_HUB_ID
+from textocvp.world_model import WorldModel
 
 
 class Mistake(Exception):
@@ -126,11 +141,9 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load and that the other commands
     # never use.
-    from textocvp.baselines.mage import mage_preset, train_mage, train_vqvae
+    from textocvp.baselines.mage import train_mage, train_vqvae
     from textocvp.data.cache import CacheError
     from textocvp.data.episodes import open_episodes
-    from textocvp.parsers.dino import DinoWeightsError
-    from textocvp.text.pretrained import TextWeightsError
     from textocvp.training import parser as train_parser
     from textocvp.training import predictor as train_predictor
     from textocvp.training.run import SettingsError
@@ -168,7 +181,7 @@ def _train(arguments: list[str]) -> None:
     }
     try:
         train[type(chosen)](chosen)
-    except (SettingsError, CacheError, DinoWeightsError, TextWeightsError) as error:
+    except (SettingsError, CacheError, WeightsError) as error:
         raise Mistake(str(error)) from error
 
 
@@ -226,22 +239,6 @@ def _info(command: InfoCommand) -> None:
     console.print(_tree(CONFIG_FILE, model.config.to_dict()))
 
 
-def _models() -> None:
-    # Imported here because it brings every architecture with it.
-    from textocvp.catalogue import catalogue
-
-    # On a screen as wide as it is; in a file or a pipe one line a model.
-    console = Console(width=None if sys.stdout.isatty() else 250)
-    table = Table("model", "what it is", "learnable", "predictor", "state", "weights", title="Models")
-    table.columns[0].no_wrap = True
-    for column in table.columns[2:4]:
-        column.justify, column.no_wrap = "right", True
-    for entry in catalogue():
-        counts = ("-" if count is None else f"{count:,}" for count in (entry.parameters, entry.predictor))
-        table.add_row(entry.name, entry.what, *counts, entry.state, entry.weights)
-    console.print(table)
-
-
 def _tree(name: str, settings: dict[str, Any]) -> Tree:
     tree = Tree(name)
     for key, value in settings.items():
@@ -250,6 +247,102 @@ def _tree(name: str, settings: dict[str, Any]) -> Tree:
         else:
             tree.add(f"{key} = {value}")
     return tree
+
+
+@dataclass(frozen=True)
+class ListedModel:
+    """A model in the list that `textocvp models` prints.
+
+    Attributes:
+        name: of its preset or its bundled checkpoint.
+        what: what it is, in a few words.
+        parameters: those that training learns, a frozen encoder's left out. None for a model that cannot be built here.
+        predictor: those of them that predict: of MAGE its second stage (text and axial transformer), as the paper
+            counts.
+        state: `trained here`: a checkpoint is in the package. `not trained here`: it can be, with nothing but data.
+            `needs weights`: it can be, once the pretrained weights of a frozen encoder are there. `figures only`: no
+            code.
+        weights: where its weights come from.
+    """
+
+    name: str
+    what: str
+    parameters: int | None
+    predictor: int | None
+    state: Literal["trained here", "not trained here", "needs weights", "figures only"]
+    weights: str
+
+
+# The one model of the paper's comparison that is not in this package; docs/models.md says why.
+SEER = ListedModel(
+    name="seer",
+    what="SEER, a latent diffusion model of 406 M parameters (as published)",
+    parameters=None,
+    predictor=None,
+    state="figures only",
+    weights="its authors' checkpoint, which nothing here reads: see docs/models.md",
+)
+
+
+def list_models() -> list[ListedModel]:
+    """Every preset, every bundled checkpoint that is none, and what is only quoted."""
+    configs: dict[str, ModelConfig | MageConfig] = {**PRESETS, **MAGE_PRESETS}
+    bundled = bundled_checkpoints()
+    for name in bundled:
+        if name not in configs:
+            with resolve_checkpoint(name) as folder:
+                data = read_json(folder)
+                is_mage = data.get("architecture") == MAGE
+                configs[name] = MageConfig.from_dict(data) if is_mage else read_config(folder)
+    return [*(_listed(name, config, name in bundled) for name, config in configs.items()), SEER]
+
+
+def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
+    # Counted on the model itself, built without memory or weights.
+    with torch.device("meta"):
+        model: Any = Mage(config) if isinstance(config, MageConfig) else TextOCVP(config)
+    shipped = PRESETS[DEFAULT_CHECKPOINT]
+    if isinstance(config, MageConfig):
+        images, parts, predictor = config.vqvae, [model], [model.text, model.axial]
+        weights = f"textocvp train vqvae --preset {name}, then train mage"
+    else:
+        images, predictor = config.parser, [model.predictor]
+        parts = [part for part in model.children() if part is not model.text or model.predictor.hears_text]
+        weights = f"textocvp train parser --preset {name}, then train predictor"
+        if name != shipped.name and (config.parser, config.renderer) == (shipped.parser, shipped.renderer):
+            weights = f"textocvp train predictor --preset {name} on the parser of {shipped.name}"
+    needed = []
+    if getattr(images, "encoder", "") == "dinov2":
+        needed.append(images.encoder_weights or DINO_HUB_ID)
+    if config.text.kind in ("t5", "minilm"):
+        needed.append(config.text.weights or (T5_HUB_ID if config.text.kind == "t5" else MINILM_PACKAGE))
+    if bundled:
+        weights = "in this package"
+    return ListedModel(
+        name=name,
+        what=DESCRIPTIONS.get(name, ""),
+        parameters=_learnable(parts),
+        predictor=_learnable(predictor),
+        state="trained here" if bundled else "needs weights" if needed else "not trained here",
+        weights=f"{', '.join(needed)}; {weights}" if needed else weights,
+    )
+
+
+def _learnable(parts: list[torch.nn.Module]) -> int:
+    return sum(p.numel() for part in parts for p in part.parameters() if p.requires_grad)
+
+
+def _models() -> None:
+    # On a screen as wide as it is; in a file or a pipe one line a model.
+    console = Console(width=None if sys.stdout.isatty() else 250)
+    table = Table("model", "what it is", "learnable", "predictor", "state", "weights", title="Models")
+    table.columns[0].no_wrap = True
+    for column in table.columns[2:4]:
+        column.justify, column.no_wrap = "right", True
+    for one in list_models():
+        counts = ("-" if count is None else f"{count:,}" for count in (one.parameters, one.predictor))
+        table.add_row(one.name, one.what, *counts, one.state, one.weights)
+    console.print(table)
 
 
 if __name__ == "__main__":

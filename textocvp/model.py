@@ -1,15 +1,7 @@
-"""TextOCVP: scene parser, text encoder, predictor and renderer in one module, and its checkpoint on disk.
-
-A checkpoint is a folder with `config.json` (a `ModelConfig`) and `model.safetensors` (every tensor of the
-model, and no other). Frozen pretrained encoders, of text and of images, are not in it: `config.json` has
-their names and fingerprints. Of a fine-tuned one the folder `text` holds architecture and tokenizer. Loading
-is strict: a checkpoint that does not fit is an error that names the field or the tensor. Nothing is ever
-unpickled.
-"""
+"""TextOCVP: scene parser, text encoder, predictor and renderer in one module (TextOCVP, TMLR 2026, figure 1)."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,7 +9,6 @@ from pathlib import Path
 
 import torch
 from huggingface_hub import PyTorchModelHubMixin
-from safetensors.torch import save_file
 from torch import nn
 
 from textocvp.checkpoint import (
@@ -25,14 +16,18 @@ from textocvp.checkpoint import (
     TEXT_FOLDER,
     WEIGHTS_FILE,
     CheckpointError,
-    checkpoint_folder,
     load_weights,
     read_config,
+    resolve_checkpoint,
+    write_checkpoint,
 )
 from textocvp.config import ModelConfig
 from textocvp.parsers import build_parser
 from textocvp.predictors import build_predictor
 from textocvp.renderers import build_renderer
+from textocvp.renderers.glimpse import GlimpseConfig
+from textocvp.renderers.patches import FeatureConfig, PatchConfig
+from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.text import build_text_encoder
 
 
@@ -42,7 +37,7 @@ class TextOCVP(
     library_name="textocvp",
     tags=["world-model", "object-centric", "video-prediction"],
 ):
-    """The text-conditioned object-centric video predictor (TextOCVP, TMLR 2026, figure 1).
+    """The text-conditioned object-centric video predictor.
 
     Attributes:
         config: every choice of architecture.
@@ -60,14 +55,9 @@ class TextOCVP(
 
     def __init__(self, config: ModelConfig, text_files: Path | None = None) -> None:
         super().__init__()
-        check_features(config)
+        check_parts(config)
         self.parser = build_parser(config.parser)
         self.text = build_text_encoder(config.text, text_files)
-        if config.predictor.color_bias and not self.text.words_have_rgb:
-            raise ValueError(
-                "predictor.color_bias=true needs words that carry RGB, which is text.kind=lexicon, not "
-                f"{config.text.kind!r}: set predictor.color_bias=false"
-            )
         self.config = replace(config, text=self.text.config)  # says which frozen weights these are
         self.predictor = build_predictor(config.predictor, config.parser.layout, config.text.dim)
         self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
@@ -79,15 +69,12 @@ class TextOCVP(
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Called by `save_pretrained(folder)`, which also writes a model card unless the folder has one."""
-        # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
-        tensors = {
-            name: tensor.detach().cpu().contiguous().clone() for name, tensor in self.state_dict().items()
-        }
-        save_file(tensors, save_directory / WEIGHTS_FILE, metadata={"format": "pt"})
+        config = self.config
+        if self.parser.dino is not None:
+            known = {"encoder_fingerprint": self.parser.dino.fingerprint}
+            config = replace(config, parser=replace(config.parser, **known))  # type: ignore[arg-type]
+        write_checkpoint(save_directory, self, config.to_dict())
         self.text.save_files(save_directory / TEXT_FOLDER)
-        parser = replace(self.config.parser, encoder_fingerprint=self.parser.encoder_fingerprint)
-        text = json.dumps(replace(self.config, parser=parser).to_dict(), indent=2) + "\n"
-        (save_directory / CONFIG_FILE).write_text(text, encoding="utf-8")
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
@@ -103,7 +90,7 @@ class TextOCVP(
         """Load a checkpoint, in evaluation mode.
 
         Args:
-            pretrained_model_name_or_path: a folder, or else the id of a repository on the Hugging Face hub.
+            pretrained_model_name_or_path: as in `resolve_checkpoint`: a bundled name, a folder or a hub id.
             revision, cache_dir, local_files_only, token: as in `huggingface_hub.snapshot_download`; hub only.
             device: where to put the model.
 
@@ -111,20 +98,62 @@ class TextOCVP(
             CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is
                 named.
         """
-        folder = checkpoint_folder(
-            pretrained_model_name_or_path,
-            revision=revision,
-            cache_dir=cache_dir,
-            local_files_only=local_files_only,
-            token=token,
-        )
-        config = read_config(folder)
-        try:
-            model = cls(config, folder / TEXT_FOLDER)
-        except (ValueError, TypeError) as error:
-            raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-        load_weights(model, folder / WEIGHTS_FILE)
+        hub = dict(revision=revision, cache_dir=cache_dir, local_files_only=local_files_only, token=token)
+        with resolve_checkpoint(pretrained_model_name_or_path, **hub) as folder:
+            config = read_config(folder)
+            try:
+                model = cls(config, folder / TEXT_FOLDER)
+            except (ValueError, TypeError) as error:
+                raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
+            load_weights(model, folder / WEIGHTS_FILE)
         return model.to(device).eval()
+
+
+def check_parts(config: ModelConfig) -> None:
+    """Raise a ValueError where two parts do not fit each other; the message says what to set."""
+    parser, renderer, text = config.parser, config.renderer, config.text
+    layout, side = parser.layout, parser.image_size
+    if isinstance(renderer, GlimpseConfig) and not layout.explicit:
+        raise ValueError(
+            "renderer.kind 'glimpse' needs parser.layout.explicit = true: it draws a slot at its own place"
+        )
+    if isinstance(renderer, UpsampleConfig):
+        if layout.explicit or parser.num_slots != 1:
+            raise ValueError(
+                "renderer.kind 'upsample' draws the one slot of a frame: set parser.kind=holistic"
+            )
+        if side < 16 or side & (side - 1):
+            raise ValueError(
+                f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {side}"
+            )
+    if isinstance(renderer, PatchConfig) and side % renderer.patches:
+        raise ValueError(f"renderer.patches: {renderer.patches} patches do not divide {side} pixels evenly")
+    if isinstance(renderer, FeatureConfig):
+        if parser.features is None:
+            raise ValueError(
+                "renderer.kind 'features' redraws the features of a frozen encoder: set parser.kind=savi and "
+                "parser.encoder=dinov2"
+            )
+        cells, width = parser.features
+        for name, has, wanted in (
+            ("renderer.feature_dim", renderer.feature_dim, width),
+            ("renderer.patches", renderer.patches, cells),
+        ):
+            if has != wanted:
+                raise ValueError(
+                    f"{name} is {has}, the encoder's features have {wanted}: set {name}={wanted}"
+                )
+    if getattr(config.predictor, "color_bias", False):  # an option of predictors that attend to the text
+        if not text.words_have_rgb:
+            raise ValueError(
+                "predictor.color_bias=true needs words that carry RGB, which is text.kind=lexicon, not "
+                f"{text.kind!r}: set predictor.color_bias=false"
+            )
+        if not layout.explicit:
+            raise ValueError(
+                "predictor.color_bias=true needs slots with explicit colour (parser.layout.explicit = true): set "
+                "predictor.color_bias=false"
+            )
 
 
 @contextmanager
@@ -137,21 +166,3 @@ def evaluating(model: nn.Module) -> Iterator[None]:
     finally:
         for module in training:
             module.training = True
-
-
-def check_features(config: ModelConfig) -> None:
-    """Raise a ValueError where renderer and parser do not speak of the same features; the message says what to set."""
-    parser, renderer = config.parser, config.renderer
-    if renderer.kind != "features":
-        return
-    if parser.encoder != "dinov2" or parser.corrector != "slot_attention":
-        raise ValueError(
-            "renderer.kind 'features' redraws the features of a frozen encoder: set parser.encoder=dinov2 and "
-            "parser.corrector=slot_attention"
-        )
-    for name, has, wanted in (
-        ("renderer.feature_dim", renderer.feature_dim, parser.encoder_dim),
-        ("renderer.patches", renderer.patches, parser.image_size // parser.encoder_patch),
-    ):
-        if has != wanted:
-            raise ValueError(f"{name} is {has}, the encoder's features have {wanted}: set {name}={wanted}")

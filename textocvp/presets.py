@@ -1,127 +1,116 @@
-"""Every choice of architecture, as dataclasses, and the named presets that put them together.
-
-A checkpoint stores one `ModelConfig` as JSON; `ModelConfig.from_dict` reads it back and names any field it does not
-know. Sizes of the published model are from TextOCVP (TMLR 2026), section 4 and appendix.
-"""
+"""The named architectures. Sizes of the published models are from TextOCVP (TMLR 2026), section 4 and appendix."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from textocvp.config import ModelConfig, ParserConfig, PredictorConfig, RendererConfig, TextConfig
+from textocvp.config import ModelConfig, PredictorConfig
+from textocvp.parsers.holistic import HolisticConfig
+from textocvp.parsers.placed import PlacedConfig
+from textocvp.parsers.savi import SaviConfig
+from textocvp.renderers.broadcast import BroadcastConfig
+from textocvp.renderers.glimpse import GlimpseConfig
+from textocvp.renderers.patches import FeatureConfig, PatchConfig
+from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
+from textocvp.text.words import GRAMMAR, TRAIN_COLORS, WordsConfig
 
-PRESETS: dict[str, ModelConfig] = {
-    # The one that ships: small enough to train on two CPU cores in hours.
-    "tabletop-small": ModelConfig(
-        name="tabletop-small",
-        predictor=PredictorConfig(
-            dim=128,
-            layers=3,
-            heads=4,
-            hidden=256,
-            attention="causal",
-            window=24,
-            color_bias=True,
-            feed_forwards=1,
-        ),
-    ),
-    # Published slots without explicit places, at sizes that two CPU cores train in minutes: for the ablations of the
-    # first slots (`parser.initializer`) and of the renderer's `mask_prior`.
-    "savi-small": ModelConfig(
-        name="savi-small",
-        parser=ParserConfig(
-            layout=SlotLayout(content=64, explicit=False),
-            encoder_stride=2,
-            iterations_first=3,
-            corrector="slot_attention",
-        ),
-        renderer=RendererConfig(kind="patches", hidden=64, mask_prior=True),
-        predictor=PredictorConfig(
-            dim=128,
-            layers=3,
-            heads=4,
-            hidden=256,
-            attention="causal",
-            window=24,
-            feed_forwards=1,
-        ),
-    ),
-    # The paper's TextOCVP-SAVi at its own sizes (CATER, 64x64).
-    "savi-cater": ModelConfig(
-        name="savi-cater",
-        parser=ParserConfig(
-            num_slots=8,
-            layout=SlotLayout(content=128, explicit=False),
-            initializer="gaussian",
-            iterations_first=3,
-            corrector="slot_attention",
-            transition_hidden=512,
-        ),
-        renderer=RendererConfig(kind="broadcast"),
-        text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
-    ),
+SMALL = PredictorConfig(
+    dim=128, layers=3, heads=4, hidden=256, attention="causal", window=24, feed_forwards=1
+)
+SMALL_SEQ = PredictorConfig(
+    kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24
+)
+PUBLISHED = PredictorConfig()
+PUBLISHED_SEQ = PredictorConfig(
+    kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal"
+)
+PUBLISHED_TEXT = WordsConfig(
+    kind="transformer", dim=512, heads=8, hidden=1024, vocabulary=GRAMMAR + TRAIN_COLORS
+)
+PUBLISHED_SAVI = SaviConfig(
+    num_slots=8,
+    layout=SlotLayout(content=128, explicit=False),
+    initializer="gaussian",
+    iterations_first=3,
+    transition_hidden=512,
+)
+
+TABLETOP_SMALL = ModelConfig(
+    name="tabletop-small",
+    parser=PlacedConfig(),
+    renderer=GlimpseConfig(),
+    text=WordsConfig(),
+    predictor=replace(SMALL, color_bias=True),
+)
+SAVI_SMALL = ModelConfig(
+    name="savi-small",
+    parser=SaviConfig(encoder_stride=2, iterations_first=3),
+    renderer=PatchConfig(hidden=64, mask_prior=True),
+    text=WordsConfig(),
+    predictor=SMALL,
+)
+SAVI_CATER = ModelConfig(
+    name="savi-cater",
+    parser=PUBLISHED_SAVI,
+    renderer=BroadcastConfig(),
+    text=PUBLISHED_TEXT,
+    predictor=PUBLISHED,
+)
+# CLIPort at 336x336: 24x24 patches.
+CLIPORT_DINO = ModelConfig(
+    name="cliport-dino",
+    parser=replace(PUBLISHED_SAVI, image_size=336, num_slots=10, encoder="dinov2"),
+    renderer=FeatureConfig(hidden=1024, patches=24),
+    text=PUBLISHED_TEXT,
+    predictor=PUBLISHED,
+)
+NON_OC_SMALL = ModelConfig(
+    name="non-oc-small",
+    parser=HolisticConfig(pool_cells=4),
+    renderer=UpsampleConfig(),
+    text=WordsConfig(),
+    predictor=replace(SMALL, standardize=True),
+)
+NON_OC = ModelConfig(
+    name="non-oc",
+    parser=HolisticConfig(layout=SlotLayout(content=512, explicit=False), encoder_channels=64),
+    renderer=UpsampleConfig(channels=64),
+    text=PUBLISHED_TEXT,
+    predictor=PUBLISHED,
+)
+OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
+OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
+
+PRESETS = {
+    one.name: one
+    for one in (
+        TABLETOP_SMALL,
+        SAVI_SMALL,
+        SAVI_CATER,
+        CLIPORT_DINO,
+        OCVP_SEQ_SMALL,
+        OCVP_SEQ,
+        NON_OC_SMALL,
+        NON_OC,
+    )
 }
 
-# The paper's TextOCVP-DINO at its own sizes (CLIPort, 336x336: 24x24 patches).
-PRESETS["cliport-dino"] = ModelConfig(
-    name="cliport-dino",
-    parser=ParserConfig(
-        image_size=336,
-        num_slots=10,
-        layout=SlotLayout(content=128, explicit=False),
-        initializer="gaussian",
-        encoder="dinov2",
-        iterations_first=3,
-        corrector="slot_attention",
-        transition_hidden=512,
-    ),
-    renderer=RendererConfig(kind="features", hidden=1024, patches=24),
-    text=TextConfig(kind="transformer", dim=512, heads=8, hidden=1024),
-)
-
-# OCVP-Seq, the predictor without text: beside the shipped model, and at its published size beside TextOCVP-SAVi.
-PRESETS["ocvp-seq-small"] = replace(
-    PRESETS["tabletop-small"],
-    name="ocvp-seq-small",
-    predictor=PredictorConfig(
-        kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24
-    ),
-)
-PRESETS["ocvp-seq"] = replace(
-    PRESETS["savi-cater"],
-    name="ocvp-seq",
-    predictor=PredictorConfig(
-        kind="ocvp-seq", dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal"
-    ),
-)
-
-# Non-OC, the same predictor over one slot a frame: beside the shipped model, and at its published size.
-PRESETS["non-oc-small"] = ModelConfig(
-    name="non-oc-small",
-    parser=ParserConfig(
-        num_slots=1, layout=SlotLayout(content=256, explicit=False), corrector="holistic", pool_cells=4
-    ),
-    renderer=RendererConfig(kind="upsample"),
-    predictor=PredictorConfig(
-        dim=128,
-        layers=3,
-        heads=4,
-        hidden=256,
-        attention="causal",
-        window=24,
-        feed_forwards=1,
-        standardize=True,
-    ),
-)
-PRESETS["non-oc"] = replace(
-    PRESETS["savi-cater"],
-    name="non-oc",
-    parser=ParserConfig(
-        num_slots=1, layout=SlotLayout(content=512, explicit=False), corrector="holistic", encoder_channels=64
-    ),
-    renderer=RendererConfig(kind="upsample", channels=64),
-)
+# What `textocvp models` says of each preset and bundled checkpoint.
+DESCRIPTIONS = {
+    "tabletop-small": "TextOCVP as it ships: placed slots, causal predictor, colour lexicon",
+    "tabletop-small-40": "tabletop-small, fine-tuned to imagine 40 frames",
+    "savi-small": "TextOCVP with published slots, small, for ablations of the parser",
+    "savi-cater": "TextOCVP-SAVi at the paper's sizes (CATER)",
+    "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
+    "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
+    "ocvp-seq": "OCVP-Seq, no text, at its published size",
+    "non-oc-small": "Non-OC, one slot for the whole scene, small",
+    "non-oc": "Non-OC at the paper's sizes",
+    "mage-small": "MAGE, no slots, small",
+    "mage": "MAGE at its published sizes",
+    "mage-dino": "MAGE-DINO at the paper's sizes (CLIPort)",
+}
 
 
 def preset(name: str) -> ModelConfig:

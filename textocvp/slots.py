@@ -59,9 +59,19 @@ class SlotState:
     presence: Tensor
 
     @property
+    def is_unused(self) -> Tensor:
+        """(..., 1) bool: holds nothing."""
+        return self.presence < 0.5
+
+    @property
     def is_thing(self) -> Tensor:
         """(..., 1) bool: neither unused nor the canvas."""
         return (self.presence >= 0.5) & (self.presence < 1.5)
+
+    @property
+    def is_background(self) -> Tensor:
+        """(..., 1) bool: the canvas behind everything."""
+        return self.presence >= 1.5
 
     def join(self) -> Tensor:
         """The slot tensor (..., C + 8)."""

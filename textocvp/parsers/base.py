@@ -1,8 +1,7 @@
-"""From frames to slots: the interface that every scene parser has, and the one place that picks one.
+"""From frames to slots: what every scene parser is.
 
-A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition
-(between frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the
-subclass's business.
+A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition (between
+frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the subclass's business.
 """
 
 from __future__ import annotations
@@ -10,12 +9,49 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from textocvp.parsers.dino import DinoEncoder
 from textocvp.slots import SlotLayout
+
+
+@dataclass(frozen=True)
+class ParserConfig:
+    """What every parser is built from; a subclass adds its own options and refuses values that make no sense.
+
+    Attributes:
+        kind: name in `textocvp.parsers.PARSERS`.
+        image_size: side of the square frame in pixels.
+        num_slots: K, background included. Can be raised when the model is used.
+        layout: what the numbers of a slot mean.
+    """
+
+    kind: str
+    image_size: int = 64
+    num_slots: int = 12
+    layout: SlotLayout = SlotLayout(content=64)
+
+    @property
+    def features(self) -> tuple[int, int] | None:
+        """Cells along a side and width of the frozen features that `Parsed` holds; None if there are none."""
+        return None
+
+    def _check_layout(self, explicit: bool) -> None:
+        if self.layout.explicit != explicit:
+            raise ValueError(
+                f"parser.kind {self.kind!r} needs parser.layout.explicit = {str(explicit).lower()}"
+            )
+
+    @staticmethod
+    def _check_heads(width: int, heads: int) -> None:
+        if width % heads:
+            raise ValueError(
+                f"parser.transition_heads = {heads} does not divide the transition's width {width}"
+            )
 
 
 @dataclass
@@ -38,18 +74,22 @@ class Parsed:
 
 
 class SceneParser(nn.Module):
-    """Frames to slots. Subclasses set `layout` and write `forward`.
+    """Frames to slots. Subclasses set `Config` and write `forward`.
 
     Attributes:
+        Config: the class of its configuration.
+        config: what it was built from.
         layout: what the numbers of one slot mean.
+        dino: its frozen image encoder, which is no part of the checkpoint; None if it learns its encoder.
     """
 
-    layout: SlotLayout
+    Config: ClassVar[type[ParserConfig]]
+    config: ParserConfig
 
-    @property
-    def encoder_fingerprint(self) -> str:
-        """Of the weights of a frozen encoder that is no part of the checkpoint; empty where there is none."""
-        return ""
+    def __init__(self, config: ParserConfig) -> None:
+        super().__init__()
+        self.config, self.layout = config, config.layout
+        self.dino: DinoEncoder | None = None
 
     @abstractmethod
     def forward(

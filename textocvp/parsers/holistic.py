@@ -7,41 +7,56 @@ above all, is the same as for many slots.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from textocvp.config import ParserConfig
 from textocvp.layers import PositionCode, init_relu_
-from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
+from textocvp.slots import SlotLayout
+
+
+@dataclass(frozen=True)
+class HolisticConfig(ParserConfig):
+    """Options of `HolisticParser`.
+
+    Attributes:
+        encoder_channels: width of the first convolution.
+        pool_cells: cells along a side of the frame whose features are averaged: 1 as published.
+    """
+
+    kind: Literal["holistic"] = "holistic"
+    num_slots: int = 1
+    layout: SlotLayout = SlotLayout(content=256, explicit=False)
+    encoder_channels: int = 32
+    pool_cells: int = 1
+
+    def __post_init__(self) -> None:
+        self._check_layout(explicit=False)  # one slot has no one place
+        if self.num_slots != 1:
+            raise ValueError(f"parser.kind 'holistic' has 1 slot, not parser.num_slots = {self.num_slots}")
+        if not 1 <= self.pool_cells <= self.image_size // 8:
+            raise ValueError(
+                f"parser.pool_cells must be 1 to {self.image_size // 8}, the features of a frame of "
+                f"{self.image_size} pixels, not {self.pool_cells}"
+            )
 
 
 class HolisticParser(SceneParser):
     """Frames to one slot each: four convolutions that halve the frame three times, average pooling, a linear layer.
 
-    Features are told where they are before they are pooled, so that the average can say what is where. With more than
-    one cell (`pool_cells`) the slot is a linear function of the cells' averages.
-
-    Raises:
-        ValueError: if the layout has explicit channels (one slot has no one place), there is more than one slot, or
-            the frame is too small to be divided into the cells.
+    Features get a code of their place before they are pooled, so that the average can say what is where. With more
+    than one cell (`pool_cells`) the slot is a linear function of the cells' averages.
     """
 
-    def __init__(self, config: ParserConfig) -> None:
-        super().__init__()
-        if config.layout.explicit:
-            raise ValueError("parser.corrector 'holistic' needs parser.layout.explicit = false")
-        if config.num_slots != 1:
-            raise ValueError(
-                f"parser.corrector 'holistic' has 1 slot, not parser.num_slots = {config.num_slots}"
-            )
-        if not 1 <= config.pool_cells <= config.image_size // 8:
-            raise ValueError(
-                f"parser.pool_cells must be 1 to {config.image_size // 8}, the features of a frame of "
-                f"{config.image_size} pixels, not {config.pool_cells}"
-            )
-        self.config, self.layout = config, config.layout
+    Config = HolisticConfig
+    config: HolisticConfig
+
+    def __init__(self, config: HolisticConfig) -> None:
+        super().__init__(config)
         channels, wide = config.encoder_channels, 2 * config.encoder_channels
         self.convolutions = nn.Sequential(
             nn.Conv2d(3, channels, 5, stride=2, padding=2),
@@ -69,7 +84,7 @@ class HolisticParser(SceneParser):
         """
         if num_slots not in (None, 1):
             raise ValueError(
-                f"this model sees a frame as one slot (parser.corrector 'holistic'); it cannot use {num_slots}"
+                f"this model sees a frame as one slot (parser.kind 'holistic'); it cannot use {num_slots}"
             )
         B, T = frames_BT3HW.shape[:2]
         features_NChw = self.mix(self.position(self.convolutions(frames_BT3HW.flatten(0, 1))))

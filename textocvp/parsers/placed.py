@@ -12,36 +12,63 @@ channels of the video are permuted: that is what lets training recolour whole sc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.config import ParserConfig
 from textocvp.crop import crop
 from textocvp.layers import pixel_grid
-from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, color_features, squared_distances
 from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
+
+
+@dataclass(frozen=True)
+class PlacedConfig(ParserConfig):
+    """Options of `PlacedParser`.
+
+    Attributes:
+        crop_cells: side in cells of the canonical picture in which the corrector reads a slot.
+        crop_extent: how many standard deviations that picture reaches to each side.
+        hidden: width of the corrector's fully connected layers.
+        transition_heads, transition_hidden: the transformer block between frames.
+    """
+
+    kind: Literal["placed"] = "placed"
+    crop_cells: int = 24
+    crop_extent: float = 2.6
+    hidden: int = 256
+    transition_heads: int = 4
+    transition_hidden: int = 128
+
+    def __post_init__(self) -> None:
+        self._check_layout(explicit=True)
+        self._check_heads(2 * self.layout.content, self.transition_heads)
 
 
 class PlaceAttention(nn.Module):
     """Which slot each pixel belongs to, by colour and place.
 
     Args:
-        sharpness: weight of a squared colour-feature distance in the logits.
-        stranger: squared colour-feature distance beyond which a pixel belongs to no thing (it goes to the background).
-        place: weight of the place term, `log(1 + d^2)`, heavy-tailed so that a thing that moved is still found.
-        reach: how far a thing may move between frames without cost, added to three times its scale.
+        color_weight: weight of a squared colour-feature distance in the logits.
+        background_distance: squared colour-feature distance beyond which a pixel belongs to no thing (it goes to the
+            background).
+        place_weight: weight of the place term, `log(1 + d^2)`, heavy-tailed so that a thing that moved is still found.
+        search_radius: how far a thing may move between frames without cost, added to three times its scale.
     """
 
     def __init__(
-        self, sharpness: float = 240.0, stranger: float = 0.12, place: float = 12.0, reach: float = 0.08
+        self,
+        color_weight: float = 240.0,
+        background_distance: float = 0.12,
+        place_weight: float = 12.0,
+        search_radius: float = 0.08,
     ) -> None:
         super().__init__()
-        self.sharpness = sharpness
-        self.stranger = stranger
-        self.place = place
-        self.reach = reach
+        self.color_weight, self.background_distance = color_weight, background_distance
+        self.place_weight, self.search_radius = place_weight, search_radius
 
     @torch.no_grad()
     def forward(self, frames: Tensor, state: SlotState) -> Tensor:
@@ -49,20 +76,21 @@ class PlaceAttention(nn.Module):
         B, _, H, W = frames.shape
         colors_BNC = color_features(frames.flatten(2).transpose(1, 2).float())
         distance_BKN = squared_distances(color_features(state.color.float()), colors_BNC)
-        logits_BKN = -self.sharpness * distance_BKN
+        logits_BKN = -self.color_weight * distance_BKN
 
         # Squared offset in units of the slot's size, added up from its two axes: far cheaper than a grid of vectors.
-        reach_BK2 = 3 * state.scale + self.reach
+        reach_BK2 = 3 * state.scale + self.search_radius
         grid_HW2 = pixel_grid(H, W, device=frames.device)
         dx_BKW = (grid_HW2[0, :, 0] - state.position[..., :1]) / reach_BK2[..., :1]
         dy_BKH = (grid_HW2[:, 0, 1] - state.position[..., 1:]) / reach_BK2[..., 1:]
         offset_BKHW = dx_BKW.square()[:, :, None, :] + dy_BKH.square()[..., None]
-        place_BKN = -self.place * torch.log1p(offset_BKHW).flatten(2)
+        place_BKN = -self.place_weight * torch.log1p(offset_BKHW).flatten(2)
 
-        is_background = state.presence > 1.5
-        things_BKN = (logits_BKN + place_BKN).masked_fill(state.presence < 0.5, float("-inf"))
-        canvas_BKN = torch.logaddexp(logits_BKN, torch.full_like(logits_BKN, -self.sharpness * self.stranger))
-        return torch.where(is_background, canvas_BKN, things_BKN).softmax(dim=1).view(B, -1, H, W)
+        things_BKN = (logits_BKN + place_BKN).masked_fill(state.is_unused, float("-inf"))
+        furthest = torch.full_like(logits_BKN, -self.color_weight * self.background_distance)
+        background_BKN = torch.logaddexp(logits_BKN, furthest)
+        attention_BKN = torch.where(state.is_background, background_BKN, things_BKN).softmax(dim=1)
+        return attention_BKN.view(B, -1, H, W)
 
 
 class PlacedCorrector(nn.Module):
@@ -73,11 +101,11 @@ class PlacedCorrector(nn.Module):
         min_pixels: a slot that gets less than this is hidden; it keeps what it had.
     """
 
-    def __init__(self, config: ParserConfig, min_pixels: float = 3.0) -> None:
+    def __init__(self, config: PlacedConfig, min_pixels: float = 3.0) -> None:
         super().__init__()
         content = config.layout.content
-        self.cells = config.glimpse_size
-        self.extent = config.glimpse_extent
+        self.cells = config.crop_cells
+        self.extent = config.crop_extent
         self.min_pixels = min_pixels
         self.attend = PlaceAttention()
         self.values = nn.Sequential(
@@ -110,14 +138,14 @@ class PlacedCorrector(nn.Module):
         position = torch.where(seen, position, state.position)
         scale = torch.where(seen, scale, state.scale)
 
-        values_BKC = self.values(self._glimpses(frames, attention, position, scale, state.color).flatten(2))
+        values_BKC = self.values(self._crops(frames, attention, position, scale, state.color).flatten(2))
         B, K, C = values_BKC.shape
         content = self.gru(values_BKC.reshape(B * K, C), state.content.reshape(B * K, C)).view(B, K, C)
         content = content + self.mlp(content)
         content = torch.where(seen, content, state.content)
         return SlotState(content, state.color, position, scale, state.presence), attention
 
-    def _glimpses(
+    def _crops(
         self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor
     ) -> Tensor:
         luminance_B1HW = ((frames + 1) / 2).mean(1, keepdim=True)
@@ -129,7 +157,7 @@ class PlacedCorrector(nn.Module):
 class PlacedTransition(nn.Module):
     """One transformer block between frames; starts as "nothing changes"."""
 
-    def __init__(self, config: ParserConfig) -> None:
+    def __init__(self, config: PlacedConfig) -> None:
         super().__init__()
         content = config.layout.content
         width = 2 * content
@@ -149,7 +177,7 @@ class PlacedTransition(nn.Module):
     def forward(self, state: SlotState) -> SlotState:
         """Where the slots (B, K) are expected in the next frame."""
         tokens = torch.cat([state.content, state.position, state.scale.log(), state.presence], dim=-1)
-        unused = state.presence[..., 0] < 0.5
+        unused = state.is_unused[..., 0]
         change = self.outputs(self.block(self.inputs(tokens), src_key_padding_mask=unused))
         content, position, log_scale = change.split([state.content.shape[-1], 2, 2], dim=-1)
         moves = state.is_thing
@@ -165,16 +193,11 @@ class PlacedTransition(nn.Module):
 class PlacedParser(SceneParser):
     """Clusters on the first frame, then transition and correction on every later one."""
 
-    def __init__(self, config: ParserConfig) -> None:
-        super().__init__()
-        if not config.layout.explicit:
-            raise ValueError("parser.corrector 'placed' needs parser.layout.explicit")
-        if config.initializer != "cluster":
-            raise ValueError(
-                "parser.corrector 'placed' starts from clusters: set parser.initializer to 'cluster'"
-            )
-        self.config = config
-        self.layout = config.layout
+    Config = PlacedConfig
+    config: PlacedConfig
+
+    def __init__(self, config: PlacedConfig) -> None:
+        super().__init__(config)
         self.initializer = ClusterInitializer()
         self.corrector = PlacedCorrector(config)
         self.transition = PlacedTransition(config)
@@ -208,9 +231,9 @@ class PlacedParser(SceneParser):
         position, scale = moments(clusters.masks)
         presence = clusters.presence[..., None].clone()
         presence[:, 0] = PRESENCE_BACKGROUND
-        is_thing = (presence > 0.5) & (presence < 1.5)
-        # The canvas fills the frame, an unused slot sits in its middle: constants, nothing to learn there.
-        position = torch.where(is_thing, position, torch.zeros_like(position))
-        scale = torch.where(is_thing, scale, torch.full_like(scale, 0.5))
         content = frames.new_zeros(B, K, self.layout.content)
-        return self.corrector(frames, SlotState(content, color, position, scale, presence), clusters.masks)
+        state = SlotState(content, color, position, scale, presence)
+        # The canvas fills the frame, an unused slot sits in its middle: constants, nothing to learn there.
+        state.position = torch.where(state.is_thing, position, torch.zeros_like(position))
+        state.scale = torch.where(state.is_thing, scale, torch.full_like(scale, 0.5))
+        return self.corrector(frames, state, clusters.masks)

@@ -7,16 +7,65 @@ frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.config import ParserConfig
-from textocvp.layers import PositionCode
-from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.layers import PositionCode, init_relu_
+from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
 from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
+from textocvp.slots import SlotLayout
+
+
+@dataclass(frozen=True)
+class SaviConfig(ParserConfig):
+    """Options of `SaviParser`: encoder -> initializer -> corrector -> transition.
+
+    Attributes:
+        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour
+            and place, or of the frozen encoder's features.
+        encoder: `conv` (learned) or `dinov2` (frozen).
+        encoder_channels: width of the convolutional encoder.
+        encoder_stride: stride of its first convolution.
+        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
+        encoder_dim, encoder_patch: width of its features and side of its patches in pixels.
+        encoder_fingerprint: of its weights, set when a model that has used them is saved; others are then an error.
+        iterations_first: corrector iterations on the first frame; later frames take one.
+        transition_heads, transition_hidden: the transformer block between frames.
+    """
+
+    kind: Literal["savi"] = "savi"
+    layout: SlotLayout = SlotLayout(content=64, explicit=False)
+    initializer: Literal["gaussian", "cluster"] = "cluster"
+    encoder: Literal["conv", "dinov2"] = "conv"
+    encoder_channels: int = 32
+    encoder_stride: int = 1
+    encoder_weights: str = ""
+    encoder_dim: int = 768
+    encoder_patch: int = 14
+    encoder_fingerprint: str = ""
+    iterations_first: int = 1
+    transition_heads: int = 4
+    transition_hidden: int = 128
+
+    def __post_init__(self) -> None:
+        self._check_layout(explicit=False)
+        self._check_heads(self.layout.dim, self.transition_heads)
+        if self.encoder == "dinov2" and self.image_size % self.encoder_patch:
+            raise ValueError(
+                f"parser.image_size: patches of {self.encoder_patch} pixels do not divide {self.image_size} pixels "
+                "evenly"
+            )
+
+    @property
+    def features(self) -> tuple[int, int] | None:
+        if self.encoder != "dinov2":
+            return None
+        return self.image_size // self.encoder_patch, self.encoder_dim
 
 
 class ConvEncoder(nn.Module):
@@ -41,11 +90,7 @@ class ConvEncoder(nn.Module):
             nn.Conv2d(channels, channels, 5, padding=2),
             nn.ReLU(),
         )
-        for module in self.convolutions:
-            if isinstance(module, nn.Conv2d):
-                # PyTorch's own initialisation shrinks the picture layer by layer, until the position code drowns it.
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        init_relu_(self.convolutions)  # else the picture shrinks until the position code drowns it
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
             nn.LayerNorm(channels), nn.Linear(channels, out_dim), nn.ReLU(), nn.Linear(out_dim, out_dim)
@@ -131,24 +176,14 @@ class SaviParser(SceneParser):
     Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
     unless the same generator state is given. With `cluster` the clusters are the attention on the first frame, and
     slots compete for locations from the second frame on.
-
-    Raises:
-        ValueError: if the layout has explicit channels (this corrector gives content only), or the
-            initializer is unknown.
     """
 
-    def __init__(self, config: ParserConfig) -> None:
-        super().__init__()
-        if config.layout.explicit:
-            raise ValueError("parser.corrector 'slot_attention' needs parser.layout.explicit = false")
-        if config.initializer not in ("gaussian", "cluster"):
-            raise ValueError(f"unknown parser.initializer {config.initializer!r}; known: gaussian, cluster")
-        if config.encoder not in ("conv", "dinov2"):
-            raise ValueError(f"unknown parser.encoder {config.encoder!r}; known: conv, dinov2")
-        self.config = config
-        self.layout = config.layout
+    Config = SaviConfig
+    config: SaviConfig
+
+    def __init__(self, config: SaviConfig) -> None:
+        super().__init__(config)
         dim = config.layout.dim
-        self.dino: DinoEncoder | None = None
         if config.encoder == "dinov2":
             self.dino = DinoEncoder(
                 config.encoder_weights or DINO_HUB_ID,
@@ -174,10 +209,6 @@ class SaviParser(SceneParser):
             batch_first=True,
             norm_first=True,
         )
-
-    @property
-    def encoder_fingerprint(self) -> str:
-        return self.dino.fingerprint if self.dino else ""
 
     def forward(
         self,
@@ -217,7 +248,7 @@ class SaviParser(SceneParser):
             guess_BKD, clusters_BKL = self.initializer(seen_BTCHW[:, 0], first_BDhw, K)
         slots, attention = [], []
         for t in range(T):
-            rounds = self.config.iterations_first if t == 0 else self.config.iterations_next
+            rounds = self.config.iterations_first if t == 0 else 1
             given_BKL = clusters_BKL if t == 0 else None
             slots_BKD, attention_BKL = self.corrector(guess_BKD, features_BTLD[:, t], rounds, given_BKL)
             slots.append(slots_BKD)

@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from textocvp.config import RendererConfig
-from textocvp.renderers.base import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig
 from textocvp.renderers.broadcast import BroadcastRenderer
 from textocvp.renderers.glimpse import GlimpseRenderer
 from textocvp.renderers.patches import FeatureRenderer, PatchRenderer
 from textocvp.renderers.upsample import UpsampleRenderer
 from textocvp.slots import SlotLayout
 
-__all__ = ["RENDERERS", "Rendered", "Renderer", "build_renderer"]
+__all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "build_renderer"]
 
 RENDERERS: dict[str, type[Renderer]] = {
-    "broadcast": BroadcastRenderer,
-    "glimpse": GlimpseRenderer,
-    "patches": PatchRenderer,
-    "features": FeatureRenderer,
-    "upsample": UpsampleRenderer,
+    "glimpse": GlimpseRenderer,  # a small picture a slot, pasted at the slot's place: the renderer that ships
+    "patches": PatchRenderer,  # an MLP draws patch by patch
+    "features": FeatureRenderer,  # published for CLIPort: the MLP redraws DINOv2's features
+    "broadcast": BroadcastRenderer,  # published for CATER: spatial broadcast decoder
+    "upsample": UpsampleRenderer,  # one slot is the whole frame: Non-OC
 }
 
 
 def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
-    """The renderer that `config.kind` names.
+    """The renderer that `config.kind` names, with random weights.
 
     Args:
         config: its kind and sizes.
         layout: what the numbers of one slot mean.
         image_size: side of the square frames it draws, in pixels.
-
-    Raises:
-        ValueError: if there is no such kind, or it does not fit the layout.
     """
-    if config.kind not in RENDERERS:
-        raise ValueError(f"unknown renderer.kind {config.kind!r}; known: {', '.join(RENDERERS)}")
-    return RENDERERS[config.kind](config, layout, image_size)  # type: ignore[call-arg, arg-type]
+    return RENDERERS[config.kind](config, layout, image_size)

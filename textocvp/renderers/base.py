@@ -1,12 +1,26 @@
-"""From slots to frames and masks: the interface that every renderer has, and the one place that picks one."""
+"""From slots to frames and masks: what every renderer is."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor, nn
+
+from textocvp.slots import SlotLayout
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """What every renderer is built from; a subclass adds its own options and refuses values that make no sense.
+
+    Attributes:
+        kind: name in `textocvp.renderers.RENDERERS`.
+    """
+
+    kind: str
 
 
 @dataclass
@@ -36,7 +50,22 @@ class Rendered:
 
 
 class Renderer(nn.Module):
-    """Slots to pixels. Subclasses write `forward` and, where colours cost much, a cheaper `masks`."""
+    """Slots to pixels. Subclasses set `Config` and write `forward` and, where colours cost much, a cheaper `masks`.
+
+    Attributes:
+        Config: the class of its configuration.
+
+    Args:
+        config: its sizes.
+        layout: what the numbers of one slot mean.
+        image_size: side of the square frames in pixels.
+    """
+
+    Config: ClassVar[type[RendererConfig]]
+
+    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__()
+        self.layout, self.image_size = layout, image_size
 
     @abstractmethod
     def forward(self, slots_BKD: Tensor) -> Rendered:

@@ -1,34 +1,40 @@
 """The published renderer: a spatial broadcast decoder (Watters et al. 2019; TextOCVP-SAVi).
 
-Every slot is copied to every pixel, told where that pixel is, and decoded by four convolutions to a colour
-and an alpha; the alphas of all slots become masks by a softmax over the slots.
+Every slot is copied to every pixel, given a code of that pixel's place, and decoded by four convolutions to a
+colour and an alpha; the alphas of all slots become masks by a softmax over the slots.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
 
-from textocvp.config import RendererConfig
 from textocvp.layers import PositionCode
-from textocvp.renderers.base import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig
 from textocvp.slots import SlotLayout
 
 
+@dataclass(frozen=True)
+class BroadcastConfig(RendererConfig):
+    """Options of `BroadcastRenderer`: `channels` is the width of its convolutions."""
+
+    kind: Literal["broadcast"] = "broadcast"
+    channels: int = 32
+
+
 class BroadcastRenderer(Renderer):
-    """Four 5x5 convolutions with `config.channels` at full resolution, then one to RGB and alpha.
+    """Four 5x5 convolutions at full resolution, then one to RGB and alpha.
 
     Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
-
-    Args:
-        config: `channels`.
-        layout: gives the slots' width.
-        image_size: side of the frames in pixels.
     """
 
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        self.image_size = image_size
+    Config = BroadcastConfig
+
+    def __init__(self, config: BroadcastConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__(config, layout, image_size)
         slot_dim, channels = layout.dim, config.channels
         self.position = PositionCode(slot_dim)
         self.convolutions = nn.Sequential(

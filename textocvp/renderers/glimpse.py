@@ -1,41 +1,52 @@
-"""Reading a slot's pixels into a small canonical picture, and drawing that picture back where the slot is.
+"""The renderer that ships: every slot is drawn in its own coordinates and pasted where the slot is.
 
 A slot that knows its place and size can be described in its own coordinates: the same block looks the same wherever
-it stands. Reading and drawing are axis-aligned, so each is two small matrix products (the separable attention of
-DRAW, Gregor et al. 2015) and differentiable in place and size. The explicit place follows Invariant Slot Attention
-(Biza et al. 2023).
+it stands (Invariant Slot Attention, Biza et al. 2023).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.config import RendererConfig
 from textocvp.crop import NOTHING, paste
-from textocvp.renderers.base import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig
 from textocvp.slots import SlotLayout, SlotState
+
+
+@dataclass(frozen=True)
+class GlimpseConfig(RendererConfig):
+    """Options of `GlimpseRenderer`.
+
+    Attributes:
+        hidden: width of the decoder's fully connected layers.
+        crop_cells: side in cells of the canonical picture of a slot.
+        crop_extent: how many standard deviations that picture reaches to each side.
+    """
+
+    kind: Literal["glimpse"] = "glimpse"
+    hidden: int = 256
+    crop_cells: int = 24
+    crop_extent: float = 2.6
 
 
 class GlimpseRenderer(Renderer):
     """Draws every slot as a canonical picture in its own colour, at its own place and size, over one canvas.
 
-    The content becomes `glimpse_size`^2 cells of (alpha logit, shading). An object's colour is the slot's explicit
+    The content becomes `crop_cells`^2 cells of (alpha logit, shading). An object's colour is the slot's explicit
     colour times its shading, so that a colour never seen in training is drawn as well as any other. The canvas, the
     picture behind everything for the fixed camera, is the background slot's colour times a learned shading.
     """
 
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        if not layout.explicit:
-            raise ValueError(
-                "renderer.kind 'glimpse' needs parser.layout.explicit: it draws a slot at its own place"
-            )
-        self.layout = layout
-        self.size = image_size
-        self.cells = config.glimpse_size
-        self.extent = config.glimpse_extent
+    Config = GlimpseConfig
+
+    def __init__(self, config: GlimpseConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__(config, layout, image_size)
+        self.cells, self.extent = config.crop_cells, config.crop_extent
         self.decoder = nn.Sequential(
             nn.Linear(layout.content, config.hidden),
             nn.ReLU(),
@@ -43,15 +54,14 @@ class GlimpseRenderer(Renderer):
             nn.ReLU(),
             nn.Linear(config.hidden, 2 * self.cells**2),
         )
-        self.canvas = nn.Parameter(torch.zeros(self.size, self.size))
+        self.canvas = nn.Parameter(torch.zeros(image_size, image_size))
 
     def forward(self, slots: Tensor) -> Rendered:
         """Frames, masks and the slots' own pictures of slots (B, K, D); see `Rendered`."""
         state = SlotState.split(slots, self.layout)
         logits_BKHW, shading_BKHW = self._pictures(state).unbind(2)
         masks_BKHW = self._compete(logits_BKHW, state)
-        is_background = (state.presence > 1.5)[..., None]  # (B, K, 1, 1)
-        shading_BKHW = torch.where(is_background, self.canvas, shading_BKHW)
+        shading_BKHW = torch.where(state.is_background[..., None], self.canvas, shading_BKHW)
         light_BKHW = 1 + shading_BKHW
         rgb_BK3 = (state.color + 1) / 2
         # The masks sum to 1, so the frame is one matrix product over the slots, without K coloured pictures.
@@ -73,10 +83,10 @@ class GlimpseRenderer(Renderer):
         cells = self.decoder(state.content).view(B, K, 2, self.cells, self.cells)[:, :, :channels]
         # Drawn relative to NOTHING, so that the zeros outside of a glimpse mean "nothing here".
         offset = torch.tensor([NOTHING, 0.0], device=cells.device, dtype=cells.dtype)[:channels, None, None]
-        return paste(cells - offset, state.position, state.scale, self.size, self.size, self.extent) + offset
+        size = self.image_size
+        return paste(cells - offset, state.position, state.scale, size, size, self.extent) + offset
 
     def _compete(self, logits_BKHW: Tensor, state: SlotState) -> Tensor:
-        presence = state.presence[..., None]  # (B, K, 1, 1)
-        logits_BKHW = torch.where(presence > 0.5, logits_BKHW, torch.full_like(logits_BKHW, NOTHING))
-        logits_BKHW = torch.where(presence > 1.5, torch.zeros_like(logits_BKHW), logits_BKHW)
+        logits_BKHW = logits_BKHW.masked_fill(state.is_unused[..., None], NOTHING)
+        logits_BKHW = logits_BKHW.masked_fill(state.is_background[..., None], 0.0)
         return F.softmax(logits_BKHW, dim=1)

@@ -120,18 +120,21 @@ def _resized(frames_N3HW: Tensor, size: int) -> Tensor:
     return F.interpolate(frames_N3HW, size=(size, size), mode="bilinear", align_corners=False, antialias=True)
 
 
+def check_channels(channels: int) -> None:
+    """Raise a ValueError if `channels` cannot be halved as often as a decoder needs."""
+    if channels % 32:
+        raise ValueError(f"renderer.image_channels must be a multiple of 32, not {channels}")
+
+
 def build_image_decoder(
     kind: Literal["cnn", "vqgan"], feature_dim: int, channels: int, image_size: int
 ) -> CnnDecoder | VqganDecoder:
     """The decoder that `kind` names.
 
     Raises:
-        ValueError: if there is no such kind, or `channels` cannot be halved as often as it needs.
+        ValueError: see `check_channels`.
     """
-    if channels < 32 or channels % 32:
-        raise ValueError(f"renderer.image_channels must be a multiple of 32, not {channels}")
+    check_channels(channels)
     if kind == "cnn":
         return CnnDecoder(feature_dim, channels, image_size)
-    if kind == "vqgan":
-        return VqganDecoder(feature_dim, channels // 2, image_size)
-    raise ValueError(f"unknown renderer.image_decoder {kind!r}; known: cnn, vqgan")
+    return VqganDecoder(feature_dim, channels // 2, image_size)

@@ -1,27 +1,77 @@
-"""An MLP that draws patch by patch: every slot is copied to every cell of a coarse grid (the decoder of DINOSAUR,
-Seitzer et al. 2023; TextOCVP-DINO), and the renderer that fills the cells with pixels.
+"""An MLP draws patch by patch: every slot is copied to every cell of a coarse grid (DINOSAUR, Seitzer et al. 2023).
 
-On a CPU this is many times faster than convolutions at full resolution, because nothing wider than four channels ever
-exists at pixel resolution.
+Two renderers fill the cells: `patches` with pixels, `features` with the features of a frozen encoder, which
+convolutions draw (TextOCVP-DINO). On a CPU `patches` is many times faster than convolutions at full resolution, because
+nothing wider than four channels ever exists at pixel resolution.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.config import RendererConfig
 from textocvp.layers import pixel_grid
-from textocvp.renderers.base import Rendered, Renderer
-from textocvp.renderers.image_decoders import build_image_decoder
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig
+from textocvp.renderers.image_decoders import build_image_decoder, check_channels
 from textocvp.slots import SlotLayout
 
 FREQUENCIES = 4
 MIN_SCALE = 0.02
 """Smallest standard deviation of the mask prior, in -1..1: two thirds of a pixel at 64x64."""
+
+
+@dataclass(frozen=True)
+class GridConfig(RendererConfig):
+    """Options of both renderers.
+
+    Attributes:
+        patches: patches along a side of the frame.
+        layers: linear layers of the MLP, at least 2.
+        hidden: their width.
+        mask_prior: add a Gaussian at the place and of the size that a linear layer reads off the slot to the logits
+            of its mask.
+    """
+
+    patches: int = 16
+    layers: int = 4
+    hidden: int = 256
+    mask_prior: bool = False
+
+    def __post_init__(self) -> None:
+        if self.layers < 2:
+            raise ValueError(f"renderer.layers must be at least 2, not {self.layers}")
+
+
+@dataclass(frozen=True)
+class PatchConfig(GridConfig):
+    """Options of `PatchRenderer`."""
+
+    kind: Literal["patches"] = "patches"
+
+
+@dataclass(frozen=True)
+class FeatureConfig(GridConfig):
+    """Options of `FeatureRenderer`; `patches` and `feature_dim` must be those of the parser's frozen encoder.
+
+    Attributes:
+        feature_dim: width of the reconstructed features.
+        image_decoder: from features to pixels: `cnn` (published) or `vqgan` (larger and sharper).
+        image_channels: width of the first convolution of `cnn`; that of `vqgan` is half of it.
+    """
+
+    kind: Literal["features"] = "features"
+    feature_dim: int = 768
+    image_decoder: Literal["cnn", "vqgan"] = "cnn"
+    image_channels: int = 1024
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_channels(self.image_channels)
 
 
 def position_code(cells: int) -> Tensor:
@@ -43,17 +93,12 @@ class PatchDecoder(nn.Module):
         layers: linear layers of the MLP, at least 2.
         hidden: their width.
         out_dim: numbers a place.
-
-    Raises:
-        ValueError: if there are fewer than 2 layers.
     """
 
     codes_LC: Tensor
 
     def __init__(self, slot_dim: int, cells: int, layers: int, hidden: int, out_dim: int) -> None:
         super().__init__()
-        if layers < 2:
-            raise ValueError(f"renderer.layers must be at least 2, not {layers}")
         codes_LC = position_code(cells)
         self.register_buffer("codes_LC", codes_LC, persistent=False)
         self.slot = nn.Linear(slot_dim, hidden)
@@ -100,40 +145,45 @@ def gaussian_prior(position_BK2: Tensor, scale_BK2: Tensor, height: int, width: 
     return -(x_BKW[:, :, None, :] + y_BKH[..., None])
 
 
-class PatchRenderer(Renderer):
-    """Every slot to a grid of patches of pixels (RGB and alpha); the alphas of all slots become masks by a softmax.
+class GridRenderer(Renderer):
+    """What both renderers share: the MLP and, with `mask_prior`, the places that it reads off the slots.
 
     Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
-
-    Args:
-        config: `patches`, `layers`, `hidden` and `mask_prior`.
-        layout: gives the slots' width.
-        image_size: side of the frames in pixels, a multiple of `config.patches`.
-
-    Raises:
-        ValueError: if the patches do not divide the frame.
     """
 
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        if image_size % config.patches:
-            raise ValueError(
-                f"renderer.patches: {config.patches} patches do not divide {image_size} pixels evenly"
-            )
-        self.cells, self.side = config.patches, image_size // config.patches
-        out_dim = 4 * self.side**2
+    def __init__(self, config: GridConfig, layout: SlotLayout, image_size: int, out_dim: int) -> None:
+        super().__init__(config, layout, image_size)
+        self.cells = config.patches
         self.decoder = PatchDecoder(layout.dim, self.cells, config.layers, config.hidden, out_dim)
         self.place = SlotPlace(layout.dim) if config.mask_prior else None
+
+    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
+        return None if self.place is None else self.place(slots_BKD)
+
+    def _masks(self, alpha_BKhw: Tensor, slots_BKD: Tensor) -> Tensor:
+        """The competition of all slots for each place (B, K, h, w)."""
+        alpha_BKhw = alpha_BKhw.float()  # bf16 masks would not sum to 1
+        if self.place is not None:
+            alpha_BKhw = alpha_BKhw + gaussian_prior(*self.place(slots_BKD), *alpha_BKhw.shape[2:])
+        return torch.softmax(alpha_BKhw, dim=1)
+
+
+class PatchRenderer(GridRenderer):
+    """Every slot to a grid of patches of pixels (RGB and alpha); the patches must divide the frame."""
+
+    Config = PatchConfig
+
+    def __init__(self, config: PatchConfig, layout: SlotLayout, image_size: int) -> None:
+        side = image_size // config.patches
+        super().__init__(config, layout, image_size, 4 * side**2)
+        self.side = side
 
     def forward(self, slots_BKD: Tensor) -> Rendered:
         B, K, _ = slots_BKD.shape
         n, s = self.cells, self.side
         patches = self.decoder(slots_BKD).view(B, K, n, n, 4, s, s)
-        alpha_BKHW = patches[:, :, :, :, 3].transpose(3, 4).reshape(B, K, n * s, n * s).float()
-        if self.place is not None:
-            position_BK2, scale_BK2 = self.place(slots_BKD)
-            alpha_BKHW = alpha_BKHW + gaussian_prior(position_BK2, scale_BK2, n * s, n * s)
-        masks_BKHW = torch.softmax(alpha_BKHW, dim=1)
+        alpha_BKHW = patches[:, :, :, :, 3].transpose(3, 4).reshape(B, K, n * s, n * s)
+        masks_BKHW = self._masks(alpha_BKHW, slots_BKD)
         # Composed patch by patch: only the sum, not every slot's picture, is put together to a frame.
         shares = masks_BKHW.view(B, K, n, s, n, s).transpose(3, 4)[:, :, :, :, None]
         composed_Bnn3ss = (shares * patches[:, :, :, :, :3]).sum(1)
@@ -144,62 +194,39 @@ class PatchRenderer(Renderer):
         frames_B3HW = composed_Bnn3ss.permute(0, 3, 1, 4, 2, 5).reshape(B, 3, n * s, n * s)
         return Rendered(frames_B3HW, masks_BKHW, draw_objects)
 
-    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
-        return None if self.place is None else self.place(slots_BKD)
 
+class FeatureRenderer(GridRenderer):
+    """Slots (B, K, D) to features (B, L, F), masks and frames."""
 
-class FeatureRenderer(Renderer):
-    """Slots (B, K, D) to features (B, L, F), masks and frames.
+    Config = FeatureConfig
 
-    Slots are exchangeable: reordering them reorders masks and object frames and leaves features and frame as they are.
-
-    Args:
-        config: `patches` (L is its square), `layers`, `hidden`, `mask_prior`, `feature_dim`, `image_decoder` and
-            `image_channels`.
-        layout: gives the slots' width.
-        image_size: side of the frames in pixels.
-    """
-
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        self.cells, self.image_size = config.patches, image_size
+    def __init__(self, config: FeatureConfig, layout: SlotLayout, image_size: int) -> None:
         # The alpha comes first, so that masks can be had without the features.
-        self.decoder = PatchDecoder(
-            layout.dim, config.patches, config.layers, config.hidden, 1 + config.feature_dim
-        )
-        self.place = SlotPlace(layout.dim) if config.mask_prior else None
+        super().__init__(config, layout, image_size, 1 + config.feature_dim)
         self.image_decoder = build_image_decoder(
             config.image_decoder, config.feature_dim, config.image_channels, image_size
         )
 
     def forward(self, slots_BKD: Tensor) -> Rendered:
         out_BKLC = self.decoder(slots_BKD)
-        shares_BKL = self._shares(out_BKLC[..., 0], slots_BKD)
+        shares_BKhw = self._shares(out_BKLC, slots_BKD)
         own_BKLF = out_BKLC[..., 1:]
-        features_BLF = (shares_BKL[..., None] * own_BKLF).sum(1)
+        features_BLF = (shares_BKhw.flatten(2)[..., None] * own_BKLF).sum(1)
 
         def draw_objects() -> Tensor:
             return self._picture(own_BKLF.flatten(0, 1)).unflatten(0, own_BKLF.shape[:2])
 
-        return Rendered(self._picture(features_BLF), self._enlarged(shares_BKL), draw_objects, features_BLF)
+        return Rendered(self._picture(features_BLF), self._enlarged(shares_BKhw), draw_objects, features_BLF)
 
     def masks(self, slots_BKD: Tensor) -> Tensor:
-        return self._enlarged(self._shares(self.decoder(slots_BKD, first=1)[..., 0], slots_BKD))
+        return self._enlarged(self._shares(self.decoder(slots_BKD, first=1), slots_BKD))
 
-    def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
-        return None if self.place is None else self.place(slots_BKD)
-
-    def _shares(self, alpha_BKL: Tensor, slots_BKD: Tensor) -> Tensor:
-        alpha_BKL = alpha_BKL.float()  # bf16 masks would not sum to 1
-        if self.place is not None:
-            position_BK2, scale_BK2 = self.place(slots_BKD)
-            alpha_BKL = alpha_BKL + gaussian_prior(position_BK2, scale_BK2, self.cells, self.cells).flatten(2)
-        return torch.softmax(alpha_BKL, dim=1)
+    def _shares(self, out_BKLC: Tensor, slots_BKD: Tensor) -> Tensor:
+        return self._masks(out_BKLC[..., 0].unflatten(2, (self.cells, self.cells)), slots_BKD)
 
     def _picture(self, features_NLF: Tensor) -> Tensor:
         return self.image_decoder(features_NLF.transpose(1, 2).unflatten(2, (self.cells, self.cells)))
 
-    def _enlarged(self, shares_BKL: Tensor) -> Tensor:
-        masks_BKhw = shares_BKL.unflatten(2, (self.cells, self.cells))
+    def _enlarged(self, shares_BKhw: Tensor) -> Tensor:
         size = (self.image_size, self.image_size)
-        return F.interpolate(masks_BKhw, size=size, mode="bilinear", align_corners=False)
+        return F.interpolate(shares_BKhw, size=size, mode="bilinear", align_corners=False)

@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 from torch import Tensor, nn
 
-from textocvp.config import RendererConfig
 from textocvp.layers import init_relu_
-from textocvp.renderers.base import Rendered, Renderer
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig
 from textocvp.slots import SlotLayout
 
 CELLS = 8
 """Side of the picture that the linear layer makes."""
 
 
+@dataclass(frozen=True)
+class UpsampleConfig(RendererConfig):
+    """Options of `UpsampleRenderer`: `channels` is the width at half the frame's size; it is twice that below."""
+
+    kind: Literal["upsample"] = "upsample"
+    channels: int = 32
+
+
 class UpsampleRenderer(Renderer):
     """A linear layer to 8x8 cells, then doublings up to the frame, each a convolution.
 
-    The last doubling is a pixel shuffle: on a CPU that takes half the time of convolutions at full resolution.
-
-    Args:
-        config: `channels`, the width at half the frame's size; it is twice that below.
-        layout: gives the slot's width.
-        image_size: side of the frames, 16, 32, 64, ... pixels.
-
-    Raises:
-        ValueError: if the layout has explicit channels, or the frames have another size.
+    The last doubling is a pixel shuffle: on a CPU that takes half the time of convolutions at full resolution. Frames
+    have 16, 32, 64, ... pixels a side.
     """
 
-    def __init__(self, config: RendererConfig, layout: SlotLayout, image_size: int) -> None:
-        super().__init__()
-        if layout.explicit:
-            raise ValueError("renderer.kind 'upsample' needs parser.layout.explicit = false")
-        doublings = (image_size // CELLS).bit_length() - 1
-        if doublings < 1 or image_size != CELLS * 2**doublings:
-            raise ValueError(
-                f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {image_size}"
-            )
+    Config = UpsampleConfig
+
+    def __init__(self, config: UpsampleConfig, layout: SlotLayout, image_size: int) -> None:
+        super().__init__(config, layout, image_size)
+        count = (image_size // CELLS).bit_length() - 1  # of doublings
         wide = 2 * config.channels
-        self.image_size = image_size
         self.cells = nn.Sequential(
             nn.Linear(layout.dim, wide * CELLS**2), nn.Unflatten(1, (wide, CELLS, CELLS))
         )
         blocks: list[nn.Module] = []
-        for doubling in range(doublings - 1):
-            width = config.channels if doubling == doublings - 2 else wide
+        for doubling in range(count - 1):
+            width = config.channels if doubling == count - 2 else wide
             blocks += [nn.ReLU(), nn.Upsample(scale_factor=2.0), nn.Conv2d(wide, width, 3, padding=1)]
-        last = wide if doublings == 1 else config.channels
+        last = wide if count == 1 else config.channels
         blocks += [nn.ReLU(), nn.Conv2d(last, 3 * 4, 3, padding=1), nn.PixelShuffle(2)]
         self.convolutions = nn.Sequential(*blocks)
         init_relu_(self)

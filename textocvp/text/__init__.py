@@ -1,19 +1,21 @@
-"""From sentences to tokens: one file a family of text encoders, and the table that names them.
-
-Four kinds (`TextConfig.kind`). `transformer` and `lexicon` read words and are trained from scratch
-(`textocvp.text.words`); `t5` and `minilm` read subwords and come pretrained (`textocvp.text.pretrained`).
-"""
+"""From sentences to tokens: one file a family of text encoders, and the table that names them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from textocvp.config import TextConfig
-from textocvp.text.base import TextEncoder, TextTokens, WordBatch
+from textocvp.text.base import TextConfig, TextEncoder, TextTokens, WordBatch
 from textocvp.text.pretrained import PretrainedEncoder
 from textocvp.text.words import WordEncoder
 
-__all__ = ["TextEncoder", "TextTokens", "WordBatch", "build_text_encoder"]
+__all__ = ["ENCODERS", "TextConfig", "TextEncoder", "TextTokens", "WordBatch", "build_text_encoder"]
+
+ENCODERS: dict[str, type[TextEncoder]] = {
+    "lexicon": WordEncoder,  # words, trained from scratch; colour words carry their RGB: the encoder that ships
+    "transformer": WordEncoder,  # words, trained from scratch
+    "t5": PretrainedEncoder,  # subwords, the paper's default
+    "minilm": PretrainedEncoder,  # subwords, a sentence model
+}
 
 
 def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEncoder:
@@ -24,11 +26,7 @@ def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEnc
             then built from it alone, for the checkpoint's tensors to fill.
 
     Raises:
-        ValueError: if there is no such kind, or its pretrained weights are missing or others than the configuration
-            says; the message says where to get them.
+        WeightsError: if its pretrained weights are missing or others than the configuration says; the message says
+            where to get them.
     """
-    if config.kind in ("transformer", "lexicon"):
-        return WordEncoder(config)
-    if config.kind in ("t5", "minilm"):
-        return PretrainedEncoder(config, files)
-    raise ValueError(f"unknown text.kind {config.kind!r}; known: transformer, lexicon, t5, minilm")
+    return ENCODERS[config.kind](config, files)

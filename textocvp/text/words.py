@@ -1,28 +1,32 @@
 """Word-level text encoders trained from scratch.
 
-`transformer`: a learned embedding for every word of the caption grammar and every training colour, then a small
-transformer (the paper finds such an encoder equal to T5 on CATER). `lexicon`: the same, but all colour words share
-one embedding and differ only in the RGB that a public lexicon gives for their name, so a colour that no caption ever
-named is understood like any other.
+`transformer`: a learned embedding for every word, then a small transformer (the paper finds such an encoder equal to T5
+on CATER). `lexicon`: the same, but all colour words share one embedding and differ only in the RGB that a public
+lexicon gives for their name, so a colour that no caption ever named is understood like any other.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
+from typing import Literal
 
 import torch
 from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
 from torch import Tensor, nn
 
-from textocvp.config import TextConfig
 from textocvp.layers import FeedForward, SelfAttention, sinusoids
-from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
+from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
 
-# Row 0 is padding, so that a padded batch needs no other bookkeeping. The order is part of every checkpoint:
-# append.
+# Row 0 is padding, so that a padded batch needs no other bookkeeping.
 SPECIAL = ("<pad>", "<unk>", "<color>")
+PAD, UNKNOWN, COLOR = range(3)
+
+# The words of the tabletop's sentences and its training colours: the vocabulary of the presets.
 GRAMMAR = (
     "put",
     "the",
@@ -41,15 +45,93 @@ GRAMMAR = (
     "to",
 )
 TRAIN_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
-PAD, UNKNOWN, COLOR = range(3)
 
 _WORD = re.compile(r"[a-z0-9']+")
+
+# Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
+# calls #76b7b2 teal; captions of tabletop scenes call it cyan. It goes by both names.
+TABLEAU_10 = {
+    "blue": "#4e79a7",
+    "orange": "#f28e2b",
+    "red": "#e15759",
+    "teal": "#76b7b2",
+    "cyan": "#76b7b2",
+    "green": "#59a14f",
+    "yellow": "#edc948",
+    "purple": "#b07aa1",
+    "pink": "#ff9da7",
+    "brown": "#9c755f",
+    "gray": "#bab0ac",
+    "grey": "#bab0ac",
+}
+
+
+@cache
+def palette() -> dict[tuple[str, ...], RGB]:
+    """Colour name, as a tuple of lower-case words, to RGB in 0..1.
+
+    Names that are no words ("blue/green") are left out.
+    """
+    xkcd = {name.removeprefix("xkcd:"): value for name, value in XKCD_COLORS.items()}
+    merged = {**xkcd, **CSS4_COLORS, **TABLEAU_10}  # later palettes win
+    return {tuple(name.split()): to_rgb(value) for name, value in merged.items() if "/" not in name}
+
+
+@cache
+def longest_name() -> int:
+    """Words in the longest colour name."""
+    return max(map(len, palette()))
+
+
+@dataclass(frozen=True)
+class WordsConfig(TextConfig):
+    """Options of `WordEncoder`.
+
+    Attributes:
+        layers, heads, hidden: the transformer.
+        vocabulary: the words that have an embedding of their own, in the order of its rows.
+        untrained: those of them that no training caption contained. Their embeddings are still random.
+    """
+
+    kind: Literal["lexicon", "transformer"] = "lexicon"
+    layers: int = 2
+    heads: int = 4
+    hidden: int = 256
+    vocabulary: tuple[str, ...] = GRAMMAR
+    untrained: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        wrong = [word for word in self.vocabulary if not _WORD.fullmatch(word)]
+        if wrong:
+            raise ValueError(f"text.vocabulary: {wrong[0]!r} is no word of lower-case letters and digits")
+        if len(set(self.vocabulary)) < len(self.vocabulary):
+            raise ValueError("text.vocabulary has a word twice")
+        unknown = [word for word in self.untrained if word not in self.vocabulary]
+        if unknown:
+            raise ValueError(f"text.untrained: {unknown[0]!r} is not in text.vocabulary")
+
+    @property
+    def words_have_rgb(self) -> bool:
+        return self.kind == "lexicon"
+
+    def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> WordsConfig:
+        """See `TextConfig.for_captions`. The lexicon's colours need no embedding, so they are no vocabulary."""
+        found = {word for caption in captions for word in _WORD.findall(caption.lower())}
+        new = [word for word in vocabulary if _WORD.fullmatch(word)]
+        # In this order the words of a preset keep their rows, and with them a seed its weights.
+        colors = [color for color in TRAIN_COLORS if color in found.union(new)]
+        words = dict.fromkeys([*self.vocabulary, *colors, *new, *sorted(found)])
+        if self.words_have_rgb:
+            words = {word: None for word in words if word in self.vocabulary or (word,) not in palette()}
+        return replace(
+            self, vocabulary=tuple(words), untrained=tuple(word for word in words if word not in found)
+        )
 
 
 class _Block(nn.Module):
     """Pre-norm transformer encoder block over the words of a sentence."""
 
-    def __init__(self, config: TextConfig) -> None:
+    def __init__(self, config: WordsConfig) -> None:
         super().__init__()
         self.norm_attention = nn.LayerNorm(config.dim, eps=1e-6)
         self.attention = SelfAttention(config.dim, config.heads)
@@ -64,21 +146,19 @@ class _Block(nn.Module):
 class WordEncoder(TextEncoder):
     """The kinds `transformer` and `lexicon`: one token a word."""
 
+    Config = WordsConfig
+    config: WordsConfig
     pad = PAD
-
     positions_LC: Tensor
 
-    def __init__(self, config: TextConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.words_have_rgb = config.kind == "lexicon"
-        vocabulary = SPECIAL + GRAMMAR + (TRAIN_COLORS if config.kind == "transformer" else ())
-        self._vocabulary = {word: row for row, word in enumerate(vocabulary)}
-        self.embedding = nn.Embedding(len(vocabulary), config.dim, padding_idx=PAD)
+    def __init__(self, config: WordsConfig, files: Path | None = None) -> None:
+        super().__init__(config)
+        self._vocabulary = {word: row for row, word in enumerate(config.vocabulary, start=len(SPECIAL))}
+        self.embedding = nn.Embedding(len(SPECIAL) + len(config.vocabulary), config.dim, padding_idx=PAD)
         nn.init.normal_(self.embedding.weight, std=0.5)
         with torch.no_grad():
             self.embedding.weight[PAD].zero_()
-        self.color_projection = nn.Linear(3, config.dim, bias=False) if config.kind == "lexicon" else None
+        self.color_projection = nn.Linear(3, config.dim, bias=False) if self.words_have_rgb else None
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.dim, eps=1e-6)
         self.register_buffer("positions_LC", sinusoids(config.max_tokens, config.dim), persistent=False)
@@ -93,11 +173,11 @@ class WordEncoder(TextEncoder):
         A colour name of several words ("light blue") is one token of the `lexicon` encoder.
         """
         found = _WORD.findall(text.lower())
-        if self.config.kind != "lexicon":
+        if not self.words_have_rgb:
             return found
         merged, at = [], 0
         while at < len(found):
-            # Words of the grammar stay words, also where some palette calls a colour by one of them.
+            # Words of the vocabulary stay words, also where some palette calls a colour by one of them.
             length = 1 if found[at] in self._vocabulary else self._color_length(found, at)
             merged.append(" ".join(found[at : at + length]))
             at += length
@@ -112,11 +192,18 @@ class WordEncoder(TextEncoder):
     def _row_and_color(self, word: str) -> tuple[int, RGB | None]:
         if word in self._vocabulary:
             return self._vocabulary[word], None
-        color = palette().get(tuple(word.split())) if self.config.kind == "lexicon" else None
+        color = palette().get(tuple(word.split())) if self.words_have_rgb else None
         return (UNKNOWN, None) if color is None else (COLOR, color)
 
     def unknown_words(self, text: str) -> list[str]:
-        return list(dict.fromkeys(w for w in self.words(text) if self._row_and_color(w)[0] == UNKNOWN))
+        untrained = self.config.untrained
+        return list(
+            dict.fromkeys(
+                word
+                for word in self.words(text)
+                if word in untrained or self._row_and_color(word)[0] == UNKNOWN
+            )
+        )
 
     def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
         return [self._row_and_color(word) for word in self.words(text)]
@@ -136,43 +223,3 @@ class WordEncoder(TextEncoder):
             x_BLC = block(x_BLC, bias_B11L)
         x_BLC = self.norm(x_BLC) * mask_BL[..., None]
         return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
-
-
-# Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
-# calls # #76b7b2 teal; captions of tabletop scenes call it cyan. It goes by both names.
-TABLEAU_10 = {
-    "blue": "#4e79a7",
-    "orange": "#f28e2b",
-    "red": "#e15759",
-    "teal": "#76b7b2",
-    "cyan": "#76b7b2",
-    "green": "#59a14f",
-    "yellow": "#edc948",
-    "purple": "#b07aa1",
-    "pink": "#ff9da7",
-    "brown": "#9c755f",
-    "gray": "#bab0ac",
-    "grey": "#bab0ac",
-}
-
-
-@cache
-def palette() -> dict[tuple[str, ...], tuple[float, float, float]]:
-    """Colour name, as a tuple of lower-case words, to RGB in 0..1.
-
-    Names that are no words ("blue/green") are left out.
-    """
-    xkcd = {name.removeprefix("xkcd:"): value for name, value in XKCD_COLORS.items()}
-    merged = {**xkcd, **CSS4_COLORS, **TABLEAU_10}  # later palettes win
-    return {tuple(name.split()): to_rgb(value) for name, value in merged.items() if "/" not in name}
-
-
-@cache
-def longest_name() -> int:
-    """Words in the longest colour name."""
-    return max(map(len, palette()))
-
-
-def color_of(name: str) -> tuple[float, float, float] | None:
-    """RGB in 0..1 of a colour name, case ignored; None if no palette has it."""
-    return palette().get(tuple(name.lower().split()))

@@ -129,7 +129,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         def measure(count: int | None) -> ParserMetrics:
             return measure_parser(model, held_out, range(len(held_out))[:count])
 
-        reader = clip_reader(run, args, episodes, getattr(model.parser, "dino", None))
+        reader = clip_reader(run, args, episodes, model.parser.dino)
         for step, clips in reader.steps(run, "parser"):
             frames_BT3HW, features_BTLF = clips.on(run.device)
             weights_BT1HW = thing_weights(frames_BT3HW, args.thing_weight)

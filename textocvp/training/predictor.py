@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from textocvp.checkpoint import resolve_checkpoint
 from textocvp.config import with_settings
 from textocvp.data.cache import FrameCache, cached_slots
-from textocvp.data.episodes import Episodes
+from textocvp.data.episodes import Episodes, open_episodes
 from textocvp.data.slot_batches import SlotBatches, padded, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
@@ -219,7 +219,8 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     """
     accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = assemble(args).to(accelerator.device)
+    with open_episodes(args.data, args.episodes) as episodes:
+        model = assemble(args, episodes.instructions).to(accelerator.device)
     layout, causal = model.config.parser.layout, model.config.predictor.attention == "causal"
     with open_data(args, model.config.parser.image_size, "parser.image_size") as (episodes, held_out):
         share = (accelerator.process_index, accelerator.num_processes)
@@ -259,8 +260,11 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     return metrics
 
 
-def assemble(args: PredictorTraining) -> TextOCVP:
+def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
     """A model with the trained parser and renderer, frozen, and a text encoder and a predictor to train.
+
+    Args:
+        captions: what a new text encoder is trained on.
 
     Raises:
         SettingsError: if an option would change the architecture of what is to be fine-tuned (but for a longer window),
@@ -284,15 +288,15 @@ def assemble(args: PredictorTraining) -> TextOCVP:
     if args.preset is not None:
         chosen = preset(args.preset)
         config = replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
-    # The text encoder is new, and so are its weights if they are frozen ones.
-    config = replace(config, text=replace(config.text, fingerprint=""), stage="predictor")
     for setting in args.set:
         if not setting.startswith(("predictor.", "text.")):
             raise SettingsError(
                 f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
             )
     with allowed_settings():
-        model = TextOCVP(with_settings(config, args.set))
+        config = with_settings(config, args.set)
+        text = config.text.for_captions(captions)
+        model = TextOCVP(replace(config, text=text, stage="predictor"))
     for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
         part.load_state_dict(source.state_dict())
         part.requires_grad_(False).eval()

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from textocvp.baselines.mage.axial import AxialConfig, AxialTransformer
-from textocvp.baselines.mage.text import PublishedTextConfig, build_text
-from textocvp.baselines.mage.vqvae import VQVAE, VQVAEConfig, read_checkpoint, write_checkpoint
-from textocvp.checkpoint import TEXT_FOLDER, Checkpoint
-from textocvp.config import TextConfig, build
+from textocvp.baselines.mage.text import TEXT_ENCODERS, PublishedTextConfig
+from textocvp.baselines.mage.vqvae import VQVAE, VQVAEConfig, read_checkpoint
+from textocvp.checkpoint import TEXT_FOLDER, Checkpoint, write_checkpoint
+from textocvp.config import build
 from textocvp.inputs import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
+from textocvp.text import TextConfig
 
 ARCHITECTURE: Literal["mage"] = "mage"
 AT_ONCE = 64  # frames to decode: more take more memory, and on a CPU more time each
@@ -27,6 +28,7 @@ class MageConfig:
     """A whole MAGE.
 
     Attributes:
+        KINDS: of each part, the classes that its `kind` names.
         name: the preset it came from.
         vqvae: frames to codes and back.
         text: sentences to tokens.
@@ -34,9 +36,11 @@ class MageConfig:
         architecture: always `mage`; tells its checkpoints from others.
     """
 
+    KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {"text": TEXT_ENCODERS}
+
     name: str
     vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
-    text: TextConfig | PublishedTextConfig = field(default_factory=PublishedTextConfig)
+    text: TextConfig = field(default_factory=PublishedTextConfig)
     axial: AxialConfig = field(default_factory=AxialConfig)
     architecture: Literal["mage"] = ARCHITECTURE
 
@@ -49,13 +53,9 @@ class MageConfig:
         """The inverse of `to_dict`.
 
         Raises:
-            ValueError: if a field is unknown or missing; the message gives its full name and the fields that exist.
+            ValueError: see `textocvp.config.build`.
         """
-        text = data.get("text")
-        if isinstance(text, Mapping):
-            kind = PublishedTextConfig if text.get("kind") == "published" else TextConfig
-            data = {**data, "text": build(kind, text, "config.text")}
-        return build(cls, data, "config")
+        return build(cls, data)
 
 
 class Mage(nn.Module):
@@ -77,7 +77,7 @@ class Mage(nn.Module):
         super().__init__()
         self._config, vqvae = config, config.vqvae
         self.vqvae = VQVAE(vqvae)
-        self.text = build_text(config.text, text_files)
+        self.text = TEXT_ENCODERS[config.text.kind](config.text, text_files)
         self.axial = AxialTransformer(config.axial, vqvae.grid, vqvae.codebook_size, config.text.dim)
 
     @property
@@ -110,7 +110,7 @@ class Mage(nn.Module):
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint."""
-        write_checkpoint(self, self.config.to_dict(), folder)
+        write_checkpoint(folder, self, self.config.to_dict())
         self.text.save_files(folder / TEXT_FOLDER)
 
     @classmethod

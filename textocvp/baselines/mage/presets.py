@@ -9,7 +9,7 @@ from __future__ import annotations
 from textocvp.baselines.mage.axial import AxialConfig
 from textocvp.baselines.mage.model import MageConfig
 from textocvp.baselines.mage.vqvae import VQVAEConfig
-from textocvp.config import TextConfig
+from textocvp.text.words import WordsConfig
 
 MAGE_PRESETS: dict[str, MageConfig] = {
     # The published sizes at 64x64.
@@ -19,7 +19,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
     "mage-small": MageConfig(
         name="mage-small",
         vqvae=VQVAEConfig(channels=64, code_dim=64),
-        text=TextConfig(kind="lexicon"),
+        text=WordsConfig(kind="lexicon"),
         axial=AxialConfig(dim=128, heads=4, hidden=256, frames=25, patch=2, copy=True),
     ),
     # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,46 +13,37 @@ import torch
 from torch import Tensor, nn
 
 from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
-from textocvp.config import TextConfig
 from textocvp.predictors.base import mask_bias
-from textocvp.text import build_text_encoder
-from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
-from textocvp.text.words import GRAMMAR, TRAIN_COLORS
+from textocvp.text import ENCODERS
+from textocvp.text.base import TextEncoder, TextTokens, WordBatch
+from textocvp.text.words import GRAMMAR, PAD, TRAIN_COLORS, UNKNOWN, WordEncoder, WordsConfig
 
-SPECIAL = ("<pad>", "<unk>")
-PAD, UNKNOWN = range(2)
-
-_WORD = re.compile(r"[a-z0-9']+")
+FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding
 
 
 @dataclass(frozen=True)
-class PublishedTextConfig:
-    """Words to tokens with a transformer from scratch.
+class PublishedTextConfig(WordsConfig):
+    """Options of `PublishedText`.
 
     Attributes:
-        kind: always `published`; tells this from the encoders of `textocvp.text`.
-        dim: token width.
-        layers: of the transformer.
-        heads: of its attention.
-        hidden: width of its feed-forward nets.
-        max_tokens: longest sentence in words; a longer one is an error.
-        vocabulary: words with an embedding each, in the order of its rows, after the special tokens.
         rows: of the word embedding. Published are more than there are words; the rest is never used.
     """
 
-    kind: Literal["published"] = "published"
+    kind: Literal["published"] = "published"  # type: ignore[assignment]
     dim: int = 512
-    layers: int = 2
+    max_tokens: int = 32
     heads: int = 16
     hidden: int = 2048
-    max_tokens: int = 32
     vocabulary: tuple[str, ...] = GRAMMAR + TRAIN_COLORS
     rows: int = 30
 
     def __post_init__(self) -> None:
-        wanted = len(SPECIAL) + len(self.vocabulary)
+        super().__post_init__()
+        wanted = FIRST_WORD + len(self.vocabulary)
         if self.rows < wanted:
-            raise ValueError(f"text.rows must be at least {wanted} for this text.vocabulary, not {self.rows}")
+            raise ValueError(
+                f"text.rows must be at least {wanted} for the words of text.vocabulary, not {self.rows}"
+            )
 
 
 class _PostNormBlock(nn.Module):
@@ -69,16 +59,15 @@ class _PostNormBlock(nn.Module):
         return self.norm_feed_forward(x_BLC + self.feed_forward(x_BLC))
 
 
-class PublishedText(TextEncoder):
-    """Words to tokens. Padding is masked, so what a sentence means does not depend on its neighbours in the batch."""
+class PublishedText(WordEncoder):
+    """Splits sentences into words as `WordEncoder` does, and encodes them with a network of its own."""
 
-    pad = PAD
-    config: PublishedTextConfig  # type: ignore[assignment]
+    Config = PublishedTextConfig  # type: ignore[assignment]
+    config: PublishedTextConfig
 
-    def __init__(self, config: PublishedTextConfig) -> None:
-        super().__init__()
-        self.config = config
-        self._numbers = {word: row for row, word in enumerate((*SPECIAL, *config.vocabulary))}
+    def __init__(self, config: PublishedTextConfig, files: Path | None = None) -> None:
+        TextEncoder.__init__(self, config)  # without the weights of a `WordEncoder`
+        self._vocabulary = {word: row for row, word in enumerate(config.vocabulary, start=FIRST_WORD)}
         self.embedding = nn.Embedding(config.rows, config.dim, padding_idx=PAD)
         self.positions_LC = nn.Parameter(torch.empty(config.max_tokens, config.dim))
         for weight in (self.embedding.weight, self.positions_LC):
@@ -89,20 +78,6 @@ class PublishedText(TextEncoder):
         self.blocks = nn.ModuleList(_PostNormBlock(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.dim)
         self.project = nn.Linear(config.dim, config.dim)
-
-    @property
-    def device(self) -> torch.device:
-        return self.embedding.weight.device
-
-    def words(self, text: str) -> list[str]:
-        """The words of a sentence, lower case, one a token."""
-        return _WORD.findall(text.lower())
-
-    def unknown_words(self, text: str) -> list[str]:
-        return list(dict.fromkeys(word for word in self.words(text) if word not in self._numbers))
-
-    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
-        return [(self._numbers.get(word, UNKNOWN), None) for word in self.words(text)]
 
     def encode(self, words: WordBatch) -> TextTokens:
         mask_BL = words.ids_BL != PAD
@@ -116,12 +91,5 @@ class PublishedText(TextEncoder):
         return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
 
 
-def build_text(config: TextConfig | PublishedTextConfig, files: Path | None = None) -> TextEncoder:
-    """The text encoder of a MAGE: its own, or any of TextOCVP's.
-
-    Raises:
-        ValueError: as `textocvp.text.build_text_encoder`.
-    """
-    if isinstance(config, PublishedTextConfig):
-        return PublishedText(config)
-    return build_text_encoder(config, files)
+TEXT_ENCODERS: dict[str, type[TextEncoder]] = {**ENCODERS, "published": PublishedText}
+"""What `text.kind` of a MAGE names: its own encoder, or any of TextOCVP's."""

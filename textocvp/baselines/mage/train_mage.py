@@ -127,9 +127,10 @@ def train(args: MageTraining) -> PredictionMetrics | None:
     """
     accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = assemble(args).to(accelerator.device)
-    run, frames = Run(args, accelerator, MageStage(model)), model.config.axial.frames
-    with open_data(args, model.config.vqvae.image_size, "vqvae.image_size") as (episodes, held_out):
+    vqvae = load_vqvae(args.vqvae)
+    with open_data(args, vqvae.config.image_size, "vqvae.image_size") as (episodes, held_out):
+        model = assemble(args, vqvae, episodes).to(accelerator.device)
+        run, frames = Run(args, accelerator, MageStage(model)), model.config.axial.frames
 
         def measured(count: int | None) -> PredictionMetrics:
             return measure(model, held_out, range(len(held_out))[:count])
@@ -162,8 +163,8 @@ def train(args: MageTraining) -> PredictionMetrics | None:
     return metrics
 
 
-def assemble(args: MageTraining) -> Mage:
-    """A model with the trained VQ-VAE, frozen, and a text encoder and a transformer to train.
+def assemble(args: MageTraining, vqvae: VQVAE, episodes: Episodes) -> Mage:
+    """A model with the trained VQ-VAE, frozen, and a transformer and a text encoder for the episodes' words to train.
 
     Raises:
         SettingsError: if a setting is of the VQ-VAE.
@@ -171,10 +172,10 @@ def assemble(args: MageTraining) -> Mage:
     for setting in args.set:
         if setting.startswith(("vqvae", "name", "architecture")):
             raise SettingsError(f"{setting!r}: the VQ-VAE comes trained; set text.* and axial.* only")
-    vqvae = load_vqvae(args.vqvae)
-    config = replace(with_settings(mage_preset(args.preset), args.set), vqvae=vqvae.config)
     with allowed_settings():
-        model = Mage(config)
+        config = with_settings(mage_preset(args.preset), args.set)
+        text = config.text.for_captions(episodes.instructions, episodes.vocabulary)
+        model = Mage(replace(config, vqvae=vqvae.config, text=text))
     model.vqvae.load_state_dict(vqvae.state_dict())
     model.vqvae.requires_grad_(False).eval()
     return model

@@ -92,7 +92,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
-        DinoWeightsError: if the weights of a frozen encoder are missing.
+        WeightsError: if the weights of a frozen encoder are missing.
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
     accelerator = open_run(args.out, args.precision)

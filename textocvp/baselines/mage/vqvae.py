@@ -7,8 +7,7 @@ Shape suffixes: N frames, H and W pixels, h and w codes along a side, C width of
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from math import exp, log2
 from pathlib import Path
@@ -16,10 +15,16 @@ from typing import Any, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from textocvp.checkpoint import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, load_weights, read_json
+from textocvp.checkpoint import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    CheckpointError,
+    load_weights,
+    read_json,
+    write_checkpoint,
+)
 from textocvp.config import build
 from textocvp.layers import full_precision
 from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
@@ -244,7 +249,7 @@ class VQVAE(nn.Module):
             features_NLF: of the frozen encoder, where they are known already.
 
         Raises:
-            DinoWeightsError: if the weights of the frozen encoder are missing.
+            WeightsError: if the weights of the frozen encoder are missing.
         """
         known = () if features_NLF is None else (features_NLF,)
         return self.encoder(frames_N3HW, *known).permute(0, 2, 3, 1)
@@ -275,7 +280,8 @@ def perplexity(counts_K: Tensor) -> float:
 
 def save_vqvae(model: VQVAE, folder: Path) -> None:
     """Write a checkpoint of a VQ-VAE alone, on which the transformer is then trained."""
-    write_checkpoint(model, {"architecture": VQVAE_ARCHITECTURE, "vqvae": asdict(model.config)}, folder)
+    config = {"architecture": VQVAE_ARCHITECTURE, "vqvae": asdict(model.config)}
+    write_checkpoint(folder, model, config)
 
 
 def load_vqvae(folder: Path) -> VQVAE:
@@ -287,22 +293,12 @@ def load_vqvae(folder: Path) -> VQVAE:
     return read_checkpoint(
         folder,
         VQVAE_ARCHITECTURE,
-        lambda data: VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "config.vqvae")),
+        lambda data: VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "vqvae")),
     )
 
 
-def write_checkpoint(model: nn.Module, config: Mapping[str, Any], folder: Path) -> None:
-    """Write `config.json` and `model.safetensors`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tensors = {
-        name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()
-    }
-    save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-
-
 def read_checkpoint(folder: Path, architecture: str, build_model: Callable[[dict[str, Any]], M]) -> M:
-    """The model that `write_checkpoint` wrote, in evaluation mode.
+    """The model of a checkpoint, in evaluation mode.
 
     Args:
         architecture: what `config.json` must say.
