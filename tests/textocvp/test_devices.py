@@ -6,8 +6,8 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-
 from tests.textocvp.both_stages import MAGE
+
 from tests.textocvp.conftest import PLACED, PUBLISHED
 from textocvp.baselines.mage.model import Mage
 from textocvp.baselines.mage.train_mage import MageStage as MageDynamics

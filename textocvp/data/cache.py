@@ -143,10 +143,10 @@ class FrameCache:
                 count = len(file["values"])
         except (KeyError, OSError) as error:
             raise CacheError(f"{path} is no cache, or damaged: {error}") from error
-        for name, wanted in self._made_from.items():
-            if found[name] != wanted:
+        for name, other in (("network", "by another network"), ("episodes", "from other episodes")):
+            if found[name] != self._made_from[name]:
                 raise CacheError(
-                    f"{path} was made from other {name} ({found[name][:12]}, wanted {wanted[:12]}): delete "
+                    f"{path} was made {other} ({found[name][:12]}, wanted {self._made_from[name][:12]}): delete "
                     f"{self.folder}, or train into another folder"
                 )
         if count != frames:

@@ -1,8 +1,8 @@
-"""Does the imagined object end where the sentence says? Measured on held-out episodes, of which the questions are asked.
+"""Does the imagined object end where the sentence says? Measured on held-out episodes, whose questions are asked.
 
-The first frame's true masks say which slot holds which object. That is for measuring only: nothing is trained on it, and
-the planner grounds slots by their looks (`planning`). Episodes without masks or questions, and slots without explicit
-places, are measured by how far imagined slots are from parsed ones.
+The first frame's true masks say which slot holds which object. That is for measuring only: nothing is trained on it,
+and the planner grounds slots by their looks (`planning`). Episodes without masks or questions, and slots without
+explicit places, are measured by how far imagined slots are from parsed ones.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def add_trials(
     slot_of: dict[int, int],
     rng: np.random.Generator,
 ) -> None:
-    """Add what a scene allows: the sentence that was played, the same object moved elsewhere, and any other sentence."""
+    """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence."""
     moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
     trials.original.append(Trial(episode, played.text, moves, ends_at))
     elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
@@ -191,12 +191,10 @@ def evaluate_following(
         for trial, ends_K2 in zip(chosen[0], ends[0], strict=True)
         if trial.moves >= 0
     ]
-    return InstructionFollowing(
-        *(reached(asked, ends_NK2) for asked, ends_NK2 in zip(chosen, ends, strict=True)),
-        error_px=float(np.median(errors)) / PIXEL if errors else math.nan,
-        grounded=_share(trial.moves >= 0 and trial.ends_at >= 0 for trial in chosen[0]),
-        episodes=len(chosen[0]),
-    )
+    original, other_target, wrong_text = map(reached, chosen, ends)
+    grounded = _share(trial.moves >= 0 and trial.ends_at >= 0 for trial in chosen[0])
+    error_px = float(np.median(errors)) / PIXEL if errors else math.nan
+    return InstructionFollowing(original, other_target, wrong_text, error_px, grounded, len(chosen[0]))
 
 
 def evaluate_slots(
@@ -213,27 +211,27 @@ def evaluate_slots(
         slots_ETKD: as `evaluate_following`.
         left_out: why it is not instruction following that is measured.
     """
-    errors, still_errors = [], []
-    for at in range(0, len(sentences[:episodes]), BATCH):
-        chosen = range(len(sentences))[:episodes][at : at + BATCH]
-        true_BTKD = slots_ETKD[chosen.start : chosen.stop]
-        imagined_BSKD = _imagined(model, true_BTKD, [sentences[index] for index in chosen])
-        for true_TKD, imagined_SKD in zip(true_BTKD, imagined_BSKD, strict=True):
-            still_SKD = true_TKD[:1].expand_as(imagined_SKD)
-            if layout.explicit:
-                position_TK2 = SlotState.split(true_TKD, layout).position
-                moving_K = ((position_TK2 - position_TK2[:1]).norm(dim=-1) > MOVES).any(dim=0)
-                moving_K &= SlotState.split(true_TKD[0], layout).is_thing[:, 0]
-                if not moving_K.any():
-                    continue
-                for values, guess in ((errors, imagined_SKD), (still_errors, still_SKD)):
-                    off_SK2 = SlotState.split(guess, layout).position - position_TK2[1:]
-                    values.append(float(off_SK2.norm(dim=-1)[:, moving_K].mean()) / PIXEL)
-            else:
-                for values, guess in ((errors, imagined_SKD), (still_errors, still_SKD)):
-                    values.append(float((guess - true_TKD[1:]).square().mean().sqrt()))
-    error, still = (bootstrap_interval(values) if values else None for values in (errors, still_errors))
-    return SlotErrors(error, still, left_out)
+    errors: list[float] = []
+    still_errors: list[float] = []
+    count = len(sentences[:episodes])
+    for at in range(0, count, BATCH):
+        rows = slice(at, min(at + BATCH, count))
+        imagined_BSKD = _imagined(model, slots_ETKD[rows], sentences[rows])
+        for true_TKD, imagined_SKD in zip(slots_ETKD[rows], imagined_BSKD, strict=True):
+            errors.append(_slot_error(imagined_SKD, true_TKD, layout))
+            still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, layout))
+    if np.isnan(errors).all():
+        return SlotErrors(None, None, left_out)
+    return SlotErrors(bootstrap_interval(errors), bootstrap_interval(still_errors), left_out)
+
+
+def _slot_error(imagined_SKD: Tensor, true_TKD: Tensor, layout: SlotLayout) -> float:
+    """See `SlotErrors.error`; NaN where nothing moves."""
+    if not layout.explicit:
+        return float((imagined_SKD - true_TKD[1:]).square().mean().sqrt())
+    true, imagined = SlotState.split(true_TKD, layout), SlotState.split(imagined_SKD, layout)
+    moves_K = ((true.position - true.position[:1]).norm(dim=-1) > MOVES).any(dim=0) & true.is_thing[0, :, 0]
+    return float((imagined.position - true.position[1:]).norm(dim=-1)[:, moves_K].mean()) / PIXEL
 
 
 @torch.no_grad()

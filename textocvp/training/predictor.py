@@ -57,7 +57,7 @@ class PredictorTraining(TrainingSettings):
     """Train the text encoder and the predictor on the slots of a trained parser (stage 2)."""
 
     parser: Path
-    """Checkpoint with the trained parser and renderer: a bundled name, a folder, or a Hugging Face hub id owner/name."""
+    """Checkpoint with the trained parser and renderer: a bundled name, a folder, or a hub id owner/name."""
     finetune: bool = False
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
     `--set predictor.window=40` they learn longer rollouts."""

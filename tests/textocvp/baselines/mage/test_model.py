@@ -12,6 +12,7 @@ import torch
 
 from tests.textocvp.baselines.mage.conftest import TEXTS
 from textocvp.baselines.mage import Mage, mage_preset
+from textocvp.baselines.mage.text import PublishedTextConfig
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import load_model
 from textocvp.world_model import WorldModel
@@ -52,8 +53,16 @@ def test_the_bundled_one_is_its_preset_and_imagines_through_the_common_door() ->
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     frames = model.imagine(picture, TEXTS[0], horizon=2)
     assert frames.shape == (1, 3, 3, 64, 64) and frames.min() >= 0 and frames.max() <= 1
-    assert replace(model.model.config, name="mage-small") == mage_preset("mage-small")  # type: ignore[attr-defined]
+    config, preset = model.model.config, mage_preset("mage-small")  # type: ignore[attr-defined]
+    assert replace(config, text=replace(config.text, untrained=())) == preset
+    assert config.text.untrained == config.text.vocabulary[5:]  # all but "put the block in bowl"
     with pytest.raises(ValueError, match="horizon"):
         model.imagine(picture, TEXTS[0], horizon=25)
     with pytest.raises(CheckpointError, match="load_model"):
         WorldModel.from_pretrained("mage-small")
+
+
+def test_the_published_encoder_needs_a_row_for_each_word() -> None:
+    PublishedTextConfig(vocabulary=("put", "it"), rows=4)
+    with pytest.raises(ValueError, match=r"text\.rows must be at least 4"):
+        PublishedTextConfig(vocabulary=("put", "it"), rows=3)

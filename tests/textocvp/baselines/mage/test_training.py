@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from tests.textocvp.baselines.mage.conftest import TINY
 from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.baselines.mage import MAGE_PRESETS, Mage, train_mage, train_vqvae
+from tests.textocvp.training.runs import same_weights, train, train_killed_after, weights
+from textocvp.baselines.mage import MAGE_PRESETS, Mage
+from textocvp.baselines.mage.text import PublishedTextConfig
 from textocvp.baselines.mage.train_mage import MageTraining, cached_codes
 from textocvp.baselines.mage.train_vqvae import VQVAETraining
 from textocvp.baselines.mage.vqvae import VQVAE, load_vqvae
 from textocvp.checkpoint import CheckpointError
 from textocvp.data.cache import CacheError
 from textocvp.data.episodes import open_episodes
-from textocvp.training import run as training
 from textocvp.training.run import SettingsError
 
 
@@ -33,57 +33,29 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def first_stage(folder: Path, out: str, **changes) -> VQVAETraining:
+def vqvae_run(folder: Path, out: str, **changes) -> VQVAETraining:
     settings = dict(preset=TINY.name, steps=4, batch=3, stride=2, warmup=1, restart_every=1) | changes
     return VQVAETraining(folder / "train.h5", folder / "val.h5", folder / out, **settings)
 
 
-def second_stage(folder: Path, out: str, **changes) -> MageTraining:
+def mage_run(folder: Path, out: str, **changes) -> MageTraining:
     settings = dict(preset=TINY.name, steps=4, batch=3, warmup=1, autoregressive=0.5) | changes
     vqvae = folder / "vqvae" / "checkpoint"
     return MageTraining(folder / "train.h5", folder / "val.h5", folder / out, vqvae=vqvae, **settings)
 
 
-def stopped_after_two(train, args, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train until the state of two steps is saved, as if killed then."""
-    save = training.save_state
-
-    def killed(accelerator, out, next_step):
-        save(accelerator, out, next_step)
-        if next_step == 2:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(training, "save_state", killed)
-        with pytest.raises(KeyboardInterrupt):
-            train(args)
-
-
-def test_a_killed_run_of_either_stage_continues_exactly(folder: Path, monkeypatch) -> None:
-    train_vqvae.train(first_stage(folder, "vqvae"))
-    resumed = first_stage(folder, "vqvae-resumed", save_minutes=0.0, restart_every=3)
+def test_a_killed_run_of_either_stage_continues_exactly(folder: Path) -> None:
     # Every third step, so that uses are counted across the interruption.
-    straight = first_stage(folder, "vqvae-straight", restart_every=3)
-    train_vqvae.train(straight)
-    stopped_after_two(train_vqvae.train, resumed, monkeypatch)
-    train_vqvae.train(resumed)
-    same_weights(straight.out, resumed.out)
-
-    straight2 = second_stage(folder, "mage-straight")
-    resumed2 = second_stage(folder, "mage-resumed", save_minutes=0.0)
-    train_mage.train(straight2)
-    stopped_after_two(train_mage.train, resumed2, monkeypatch)
-    train_mage.train(resumed2)
-    same_weights(straight2.out, resumed2.out)
-    # The second stage leaves the VQ-VAE as it was trained, and moves all the rest.
-    model, vqvae = Mage.load(straight2.out / "checkpoint"), load_vqvae(folder / "vqvae" / "checkpoint")
-    for name, tensor in vqvae.state_dict().items():
-        assert torch.equal(model.vqvae.state_dict()[name], tensor)
-
-
-def same_weights(one: Path, other: Path) -> None:
-    a, b = (load_file(out / "checkpoint" / "model.safetensors") for out in (one, other))
-    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    for run, out in ((vqvae_run, "vqvae"), (mage_run, "mage")):
+        changes = {"restart_every": 3} if run is vqvae_run else {}
+        straight, resumed = run(folder, out, **changes), run(folder, f"{out}-resumed", **changes)
+        train(straight)
+        train_killed_after(resumed, 2)
+        train(resumed)
+        assert same_weights(straight.out, resumed.out)
+    # The second stage leaves the VQ-VAE as it was trained.
+    trained, found = weights(folder / "vqvae"), weights(folder / "mage")
+    assert all(torch.equal(found[f"vqvae.{name}"], tensor) for name, tensor in trained.items())
 
 
 def test_codes_are_kept_for_the_vqvae_that_made_them(folder: Path) -> None:
@@ -106,38 +78,44 @@ def test_codes_are_kept_for_the_vqvae_that_made_them(folder: Path) -> None:
 
 
 def test_what_does_not_fit_is_refused_by_name(folder: Path) -> None:
-    train_vqvae.train(first_stage(folder, "vqvae", steps=1))
+    train(vqvae_run(folder, "vqvae", steps=1))
     with pytest.raises(SettingsError, match="comes trained"):
-        train_mage.train(second_stage(folder, "mage", set=("vqvae.channels=4",)))
+        train(mage_run(folder, "mage", set=("vqvae.channels=4",)))
     with pytest.raises(SettingsError, match="32 pixels"):
-        train_vqvae.train(first_stage(folder, "big", set=("vqvae.image_size=64",)))
+        train(vqvae_run(folder, "big", set=("vqvae.image_size=64",)))
     with pytest.raises(SettingsError, match="dinov2"):
-        train_vqvae.train(first_stage(folder, "cached", cache_features=True))
+        train(vqvae_run(folder, "cached", cache_features=True))
     with pytest.raises(CheckpointError, match="'mage-vqvae' model"):
         Mage.load(folder / "vqvae" / "checkpoint")
 
 
+@pytest.mark.parametrize("published", [False, True])
+def test_words_come_from_the_episodes_and_stand_in_the_checkpoint(folder: Path, published: bool) -> None:
+    if published:
+        text = PublishedTextConfig(dim=24, layers=1, heads=2, hidden=24, vocabulary=("put", "stack"))
+        MAGE_PRESETS[TINY.name] = replace(TINY, text=text)  # the fixture puts the old one back
+    train(vqvae_run(folder, "vqvae", steps=1))
+    train(mage_run(folder, "mage", steps=1))
+    text = Mage.load(folder / "mage" / "checkpoint").text
+    assert text.unknown_words("put the red block in the blue bowl") == []
+    assert text.unknown_words("put the red cube onto it") == ["cube", "onto", "it"]
+    untrained = "stack" if published else "move"  # in the preset's vocabulary, in no caption
+    assert text.unknown_words(f"{untrained} the block") == [untrained]
+
+
 def test_mage_dino_trains_from_its_features_and_keeps_them_frozen(folder: Path) -> None:
-    weights = write_tiny_dino(folder / "dino")
-    vqvae = replace(
-        TINY.vqvae,
-        encoder="dinov2",
-        channels=32,
-        encoder_weights=str(weights),
-        encoder_dim=DIM,
-        encoder_patch=PATCH,
-    )
+    dino = dict(encoder="dinov2", channels=32, encoder_dim=DIM, encoder_patch=PATCH)
+    vqvae = replace(TINY.vqvae, encoder_weights=str(write_tiny_dino(folder / "dino")), **dino)
     MAGE_PRESETS[TINY.name] = replace(TINY, vqvae=vqvae)  # the fixture puts the old one back
-    cached = first_stage(folder, "vqvae", steps=2, cache_features=True)
-    train_vqvae.train(cached)
-    train_vqvae.train(first_stage(folder, "plain", steps=2))
-    found = load_file(cached.out / "checkpoint" / "model.safetensors")
-    for name, tensor in load_file(folder / "plain" / "checkpoint" / "model.safetensors").items():
+    train(vqvae_run(folder, "vqvae", steps=2, cache_features=True))
+    train(vqvae_run(folder, "plain", steps=2))
+    found = weights(folder / "vqvae")
+    for name, tensor in weights(folder / "plain").items():
         torch.testing.assert_close(found[name], tensor, atol=2e-2, rtol=0)  # the cache has half the digits
     assert not any("dino" in name for name in found)
-    model = load_vqvae(cached.out / "checkpoint")
+    model = load_vqvae(folder / "vqvae" / "checkpoint")
     assert model.config.encoder_fingerprint and model.config.grid == 32 // PATCH
-    train_mage.train(second_stage(folder, "mage", steps=2))
+    train(mage_run(folder, "mage", steps=2))
     other = write_tiny_dino(folder / "other", seed=1)
     moved = VQVAE(replace(model.config, encoder_weights=str(other)))
     with pytest.raises(ValueError, match=r"vqvae\.encoder_fingerprint"):

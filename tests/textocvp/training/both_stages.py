@@ -1,6 +1,6 @@
 """Every stage of training on toy episodes, for tests that compare one process with several.
 
-torchrun --standalone --nproc_per_node 2 -m tests.textocvp.both_stages FOLDER NAME
+torchrun --standalone --nproc_per_node 2 -m tests.textocvp.training.both_stages FOLDER NAME
 """
 
 from __future__ import annotations
