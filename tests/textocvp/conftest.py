@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from textocvp.config import ModelConfig, ParserConfig, PredictorConfig, RendererConfig, TextConfig
+from textocvp.config import ModelConfig, PredictorConfig
 from textocvp.model import TextOCVP
+from textocvp.parsers.holistic import HolisticConfig
+from textocvp.parsers.placed import PlacedConfig
+from textocvp.parsers.savi import SaviConfig
+from textocvp.renderers.broadcast import BroadcastConfig
+from textocvp.renderers.glimpse import GlimpseConfig
+from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
+from textocvp.text.words import GRAMMAR, TRAIN_COLORS, WordsConfig
 from textocvp.world_model import WorldModel
 
-SMALL_TEXT = TextConfig(kind="lexicon", dim=16, layers=1, heads=2, hidden=16)
+SMALL_TEXT = WordsConfig(dim=16, layers=1, heads=2, hidden=16)
 
 PLACED = ModelConfig(
     name="tiny-placed",
-    parser=ParserConfig(image_size=32, num_slots=5, layout=SlotLayout(content=8), hidden=16, glimpse_size=8),
-    renderer=RendererConfig(hidden=16, glimpse_size=8),
+    parser=PlacedConfig(image_size=32, num_slots=5, layout=SlotLayout(content=8), hidden=16, crop_cells=8),
+    renderer=GlimpseConfig(hidden=16, crop_cells=8),
     text=SMALL_TEXT,
     predictor=PredictorConfig(
         dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, color_bias=True, feed_forwards=1
@@ -25,20 +34,31 @@ PLACED = ModelConfig(
 
 PUBLISHED = ModelConfig(
     name="tiny-published",
-    parser=ParserConfig(
+    parser=SaviConfig(
         image_size=32,
         num_slots=4,
         layout=SlotLayout(content=12, explicit=False),
         initializer="gaussian",
         iterations_first=2,
-        corrector="slot_attention",
         encoder_channels=8,
         encoder_stride=2,
         transition_hidden=16,
     ),
-    renderer=RendererConfig(kind="broadcast", channels=8),
-    text=TextConfig(kind="transformer", dim=16, layers=1, heads=2, hidden=16),
+    renderer=BroadcastConfig(channels=8),
+    text=replace(SMALL_TEXT, kind="transformer", vocabulary=GRAMMAR + TRAIN_COLORS),
     predictor=PredictorConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
+)
+
+NON_OC = ModelConfig(
+    name="tiny-non-oc",
+    parser=HolisticConfig(
+        image_size=32, layout=SlotLayout(content=24, explicit=False), encoder_channels=8, pool_cells=2
+    ),
+    renderer=UpsampleConfig(channels=8),
+    text=SMALL_TEXT,
+    predictor=PredictorConfig(
+        dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, standardize=True
+    ),
 )
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from tests.textocvp.conftest import PLACED, build
 from textocvp import cli
-from textocvp.catalogue import catalogue
 
 TEXT = "put the red block in the blue bowl"
 
@@ -99,7 +98,7 @@ def test_models_says_of_every_preset_what_it_is(capsys) -> None:
     assert cli.main(["models"]) == 0
     printed = capsys.readouterr().out
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in printed.splitlines()]
-    for entry in catalogue():
+    for entry in cli.list_models():
         counts = ["-" if n is None else f"{n:,}" for n in (entry.parameters, entry.predictor)]
         assert [entry.name, entry.what, *counts, entry.state, entry.weights] in rows
     assert cli.main(["info"]) == 0

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.textocvp.conftest import PLACED, PUBLISHED, build
-from tests.textocvp.test_holistic import NON_OC
+from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
 from textocvp.config import ModelConfig
 from textocvp.training.predictor import PredictorStage, PredictorTraining, assemble
 

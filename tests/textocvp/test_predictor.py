@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.config import PredictorConfig, TextConfig
+from textocvp.config import PredictorConfig
 from textocvp.predictors import build_predictor
 from textocvp.predictors.base import SlotPredictor
 from textocvp.predictors.textocvp import Predictor, color_match
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text import build_text_encoder
+from textocvp.text.words import WordsConfig
 
 EXPLICIT = SlotLayout(content=6)
 IMPLICIT = SlotLayout(content=12, explicit=False)
@@ -55,7 +56,7 @@ def scene(layout=EXPLICIT, batch=2, frames=4, slots=7, absent=2) -> torch.Tensor
 
 def text(texts=TEXTS):
     torch.manual_seed(3)
-    return build_text_encoder(TextConfig(dim=32, hidden=64)).eval()(texts)
+    return build_text_encoder(WordsConfig(dim=32, hidden=64)).eval()(texts)
 
 
 @pytest.mark.parametrize(

@@ -216,14 +216,14 @@ def test_a_hub_id_that_cannot_be_fetched_says_so(monkeypatch: pytest.MonkeyPatch
     def offline(*args: object, **kwargs: object) -> str:
         raise OSError("no network")
 
-    monkeypatch.setattr("textocvp.model.snapshot_download", offline)
+    monkeypatch.setattr("textocvp.checkpoint.snapshot_download", offline)
     with pytest.raises(CheckpointError, match=r"someone/model.*no network.*Bundled"):
         WorldModel.from_pretrained("someone/model")
 
 
 def test_a_hub_id_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     build(PLACED).save_pretrained(tmp_path)
-    monkeypatch.setattr("textocvp.model.snapshot_download", lambda name, **_: str(tmp_path))
+    monkeypatch.setattr("textocvp.checkpoint.snapshot_download", lambda name, **_: str(tmp_path))
     assert WorldModel.from_pretrained("someone/model").checkpoint.name == "someone/model"
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.textocvp.baselines.mage.conftest import TINY
-from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
+from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from tests.textocvp.training.runs import same_weights, train, train_killed_after, weights
 from textocvp.baselines.mage import MAGE_PRESETS, Mage

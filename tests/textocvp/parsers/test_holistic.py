@@ -11,31 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.textocvp.conftest import SMALL_TEXT, build
+from tests.textocvp.conftest import NON_OC, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel, cli
-from textocvp.config import ModelConfig, ParserConfig, PredictorConfig, RendererConfig
+from textocvp.config import with_settings
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS, preset
-from textocvp.slots import SlotLayout
 
 TEXT = "put the red block in the blue bowl"
-NON_OC = ModelConfig(
-    name="tiny-non-oc",
-    parser=ParserConfig(
-        image_size=32,
-        num_slots=1,
-        layout=SlotLayout(content=24, explicit=False),
-        corrector="holistic",
-        encoder_channels=8,
-        pool_cells=2,
-    ),
-    renderer=RendererConfig(kind="upsample", channels=8),
-    text=SMALL_TEXT,
-    predictor=PredictorConfig(
-        dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, standardize=True
-    ),
-)
 
 
 @pytest.fixture
@@ -87,19 +70,20 @@ def test_it_is_used_like_every_model(model: TextOCVP, scene: np.ndarray, tmp_pat
 
 
 def test_what_does_not_fit_is_named():
-    def change(part: str, **changes: object) -> ModelConfig:
-        return replace(NON_OC, **{part: replace(getattr(NON_OC, part), **changes)})
-
     wrong = [
-        (change("parser", layout=SlotLayout(content=16)), "'holistic' needs parser.layout.explicit = false"),
-        (change("parser", num_slots=8), "1 slot, not parser.num_slots = 8"),
-        (change("parser", pool_cells=5), "pool_cells must be 1 to 4"),
-        (change("parser", image_size=48), "frames of 16, 32, 64, 128, ... pixels, not 48"),
-        (change("parser", image_size=8, pool_cells=1), "not 8"),
+        ("parser.layout.explicit=true", "'holistic' needs parser.layout.explicit = false"),
+        ("parser.num_slots=8", "1 slot, not parser.num_slots = 8"),
+        ("parser.pool_cells=5", "pool_cells must be 1 to 4"),
+        ("parser.image_size=48", "frames of 16, 32, 64, 128, ... pixels, not 48"),
+        ("parser.image_size=8 parser.pool_cells=1", "not 8"),
+        (
+            "parser.kind=savi parser.num_slots=4",
+            "'upsample' draws the one slot of a frame: set parser.kind=holistic",
+        ),
     ]
-    for config, message in wrong:
+    for settings, message in wrong:
         with pytest.raises(ValueError, match=message):
-            TextOCVP(config)
+            TextOCVP(with_settings(NON_OC, settings.split()))
     model = build(NON_OC)
     with pytest.raises(ValueError, match="sees a frame as one slot"):
         model.parser(torch.zeros(1, 1, 3, 32, 32), num_slots=2)

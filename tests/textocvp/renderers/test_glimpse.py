@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.config import RendererConfig
+from textocvp.config import with_settings
 from textocvp.crop import crop, paste
+from textocvp.model import TextOCVP
 from textocvp.presets import preset
-from textocvp.renderers.glimpse import GlimpseRenderer
+from textocvp.renderers.glimpse import GlimpseConfig, GlimpseRenderer
 from textocvp.slots import PRESENCE_BACKGROUND, SlotLayout, SlotState
 
 LAYOUT = SlotLayout(content=8)
@@ -33,7 +34,7 @@ def slots(generator: torch.Generator, batch: int = 2, things: int = 3, unused: i
 
 def renderer() -> GlimpseRenderer:
     torch.manual_seed(0)
-    return GlimpseRenderer(RendererConfig(hidden=32, glimpse_size=16), LAYOUT, image_size=64)
+    return GlimpseRenderer(GlimpseConfig(hidden=32, crop_cells=16), LAYOUT, image_size=64)
 
 
 def test_what_is_read_is_drawn_back_where_it_was() -> None:
@@ -93,5 +94,6 @@ def test_gradients_reach_place_size_content_and_canvas() -> None:
 
 
 def test_slots_without_a_place_are_refused() -> None:
-    with pytest.raises(ValueError, match="explicit"):
-        GlimpseRenderer(preset("tabletop-small").renderer, SlotLayout(content=8, explicit=False), 64)
+    config = with_settings(preset("savi-small"), ["renderer.kind=glimpse"])
+    with pytest.raises(ValueError, match=r"'glimpse' needs parser\.layout\.explicit = true"):
+        TextOCVP(config)

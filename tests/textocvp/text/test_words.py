@@ -1,21 +1,25 @@
-"""Text encoders: what they know, what padding does, and that colours are looked up, not learned by name."""
+"""Encoders of words: what they know, what padding does, and that colours are looked up, not learned by name."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from textocvp.config import TextConfig
 from textocvp.text import build_text_encoder
 from textocvp.text.base import TextEncoder
-from textocvp.text.words import COLOR, TABLEAU_10, color_of, palette
+from textocvp.text.words import COLOR, GRAMMAR, TABLEAU_10, TRAIN_COLORS, WordsConfig, palette
 
 CAPTION = "put the red block in the gray bowl"
 
 
-def encoder(kind: str) -> TextEncoder:
+WORDS = {"lexicon": GRAMMAR, "transformer": GRAMMAR + TRAIN_COLORS}
+
+
+def encoder(kind: str, **changes: object) -> TextEncoder:
     torch.manual_seed(0)
-    return build_text_encoder(TextConfig(kind=kind, dim=32, hidden=64)).eval()
+    return build_text_encoder(
+        WordsConfig(kind, 32, hidden=64, **{"vocabulary": WORDS[kind], **changes})
+    ).eval()
 
 
 @pytest.mark.parametrize("kind", ["transformer", "lexicon"])
@@ -46,13 +50,44 @@ def test_unknown_words_are_named_once_and_in_order():
     assert encoder("transformer").unknown_words("put the red block in the turquoise bowl") == ["turquoise"]
 
 
+def test_words_that_no_caption_contained_are_unknown_too():
+    config = WordsConfig(untrained=("move", "onto"), vocabulary=(*GRAMMAR, "onto"))
+    model = build_text_encoder(config)
+    assert model.unknown_words("move the red block onto the blue bowl, move!") == ["move", "onto"]
+    assert model.lookup(["move onto"]).ids_BL.tolist() == [[14, 18]]  # they have rows of their own
+
+
+def test_the_vocabulary_is_in_the_configuration():
+    model = encoder("lexicon", vocabulary=("stack", "the"))
+    assert model.embedding.weight.shape == (3 + 2, 32)
+    assert model.unknown_words("stack the red block") == ["block"]
+    for wrong, message in (
+        ({"vocabulary": ("put", "put")}, "word twice"),
+        ({"vocabulary": ("Put",)}, "'Put' is no word"),
+        ({"untrained": ("stack",)}, "'stack' is not in text.vocabulary"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            WordsConfig(**wrong)
+
+
+def test_new_captions_bring_new_words_and_old_ones_keep_their_rows():
+    lexicon = WordsConfig().for_captions(["Stack the red block on the light block"])
+    assert lexicon.vocabulary == (*GRAMMAR, "light", "stack")  # red is in the palette
+    assert set(GRAMMAR) - set(lexicon.untrained) == {"the", "block", "on"}
+    words = WordsConfig(kind="transformer").for_captions([CAPTION], vocabulary=("under", "gray", "red"))
+    assert words.vocabulary == (*GRAMMAR, "red", "gray", "under")
+    assert {"under", "and"} < set(words.untrained) and not {"red", "gray", "put"} & set(words.untrained)
+    preset = WordsConfig(kind="transformer").for_captions(f"put the {c} block" for c in TRAIN_COLORS)
+    assert preset.vocabulary == WORDS["transformer"]
+
+
 def test_colors_of_the_lexicon_differ_in_rgb_only():
     model = encoder("lexicon")
     words = model.lookup(["put the red block in the turquoise bowl"])
     named = words.names_color_BL[0]
     assert named.tolist() == [False, False, True, False, False, False, True, False]
     assert (words.ids_BL[0][named] == COLOR).all()
-    torch.testing.assert_close(words.colors_BL3[0, 2], torch.tensor(color_of("red")) * 2 - 1)
+    torch.testing.assert_close(words.colors_BL3[0, 2], torch.tensor(palette()["red",]) * 2 - 1)
     assert (words.colors_BL3[0][~named] == 0).all()
     assert not encoder("transformer").lookup([CAPTION]).names_color_BL.any()
 
@@ -69,11 +104,10 @@ def test_a_color_name_of_two_words_is_one_token():
 
 
 def test_palettes_are_asked_in_order():
-    assert color_of("Red") == pytest.approx((225 / 255, 87 / 255, 89 / 255))  # Tableau, not CSS or XKCD
-    assert color_of("turquoise") == pytest.approx((64 / 255, 224 / 255, 208 / 255))  # CSS, not XKCD
-    assert color_of("windows blue") is not None  # XKCD only
-    assert color_of("wug") is None
-    assert len(palette()) > 900 and len(TABLEAU_10) == 12
+    assert palette()["red",] == pytest.approx((225 / 255, 87 / 255, 89 / 255))  # Tableau, not CSS or XKCD
+    assert palette()["turquoise",] == pytest.approx((64 / 255, 224 / 255, 208 / 255))  # CSS, not XKCD
+    assert ("windows", "blue") in palette()  # XKCD only
+    assert ("wug",) not in palette() and len(palette()) > 900 and len(TABLEAU_10) == 12
 
 
 def test_channel_permutation_moves_colors_only():

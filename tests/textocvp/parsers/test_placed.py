@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.config import ParserConfig
 from textocvp.parsers import build_parser
-from textocvp.parsers.placed import PlacedParser
+from textocvp.parsers.placed import PlacedConfig, PlacedParser
 from textocvp.slots import SlotLayout, SlotState, moments
 
-CONFIG = ParserConfig(num_slots=6, layout=SlotLayout(content=16), hidden=32)
+CONFIG = PlacedConfig(num_slots=6, layout=SlotLayout(content=16), hidden=32)
 RED, BLUE, DARK = (255, 87, 89), (78, 121, 167), (47, 47, 47)
 
 
@@ -103,7 +102,7 @@ def test_moments_are_as_precise_under_autocast() -> None:
 
 
 def test_configurations_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="explicit"):
-        build_parser(ParserConfig(layout=SlotLayout(content=8, explicit=False)))
-    with pytest.raises(ValueError, match="cluster"):
-        build_parser(ParserConfig(initializer="gaussian"))
+    with pytest.raises(ValueError, match=r"'placed' needs parser\.layout\.explicit = true"):
+        PlacedConfig(layout=SlotLayout(content=8, explicit=False))
+    with pytest.raises(ValueError, match=r"transition_heads = 3 does not divide the transition's width 128"):
+        PlacedConfig(transition_heads=3)

