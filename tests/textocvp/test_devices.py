@@ -6,9 +6,9 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from tests.textocvp.both_stages import MAGE
 
 from tests.textocvp.conftest import PLACED, PUBLISHED
+from tests.textocvp.training.both_stages import MAGE
 from textocvp.baselines.mage.model import Mage
 from textocvp.baselines.mage.train_mage import MageStage as MageDynamics
 from textocvp.config import ModelConfig
@@ -39,15 +39,14 @@ def test_both_stages_stay_on_the_device(config: ModelConfig) -> None:
     weights = thing_weights(frames, 4.0)
     generators = [torch.Generator().manual_seed(seed) for seed in range(2)]
     redrawing = ParserStage(model)
-    loss = redrawing(frames, weights.flatten(0, 1), whole=weights.sum(), share=0.5, generator=generators)
+    loss = redrawing(frames, weights.flatten(0, 1), whole=weights.sum(), weight=0.5, generator=generators)
     loss.total(0.1, 0.1, 1.0).backward()
     assert {p.grad.device.type for p in redrawing.parameters() if p.grad is not None} == {"meta"}
 
     slots = torch.empty(2, 4, config.parser.num_slots, layout.dim, device="meta")
     dynamics = PredictorStage(model)
     if config.predictor.attention == "causal":
-        forgetful = torch.zeros(2, dtype=torch.bool, device="meta")
-        predicted = dynamics(slots[:, :3], words, 0, forgetful)
+        predicted = dynamics(slots[:, :3], words, 0)
     else:  # a rollout picks the slots that are used, which needs numbers
         predicted = model.predictor(slots[:, :3], model.text.encode(words))
     true = slots[:, 3 - predicted.shape[1] :]

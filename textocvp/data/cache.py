@@ -99,7 +99,11 @@ class FrameCache:
         Raises:
             CacheError: if a part is missing.
         """
-        return np.concatenate([self._open(part)["values"][:] for part in range(len(self._firsts))])
+        values = np.concatenate([self._open(part)["values"][:] for part in range(len(self._firsts))])
+        for file in self._files.values():
+            file.close()
+        self._files = {}
+        return values
 
     def episode(self, index: int) -> NDArray[Any]:
         """The values (T, ...) of one episode, in memory."""
@@ -230,7 +234,7 @@ def cached_features(
     At the published size they are 0.9 MB a frame. `batch` frames are encoded at once.
 
     Raises:
-        DinoWeightsError: if the encoder's weights are missing.
+        WeightsError: if the encoder's weights are missing.
         CacheError: if `folder` holds features of another encoder or of other episodes.
     """
 

@@ -11,7 +11,7 @@ import json
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -111,7 +111,7 @@ class Episodes(ABC):
     @property
     def vocabulary(self) -> tuple[str, ...]:
         """The words that sentences about such scenes can contain; by default those of the instructions."""
-        return tuple(sorted(set(words_of(self.instructions))))
+        return tuple(sorted(words_of(self.instructions)))
 
     @property
     def fingerprint(self) -> str:
@@ -381,9 +381,9 @@ def swapped_questions(
     )
 
 
-def words_of(sentences: tuple[str, ...]) -> list[str]:
+def words_of(sentences: Iterable[str]) -> set[str]:
     """All words of some sentences, lower case."""
-    return re.findall(r"[a-z0-9']+", "\n".join(sentences).lower())
+    return set(re.findall(r"[a-z0-9']+", "\n".join(sentences).lower()))
 
 
 def _no_such(path: Path) -> str:

@@ -99,7 +99,7 @@ def clip_reader(run: Run, args: ClipTraining, episodes: Episodes, encoder: DinoE
 
     Raises:
         SettingsError: if no episode is long enough for a clip, or there is no frozen encoder to cache features of.
-        DinoWeightsError: if its weights are missing.
+        WeightsError: if its weights are missing.
         CacheError: if `args.out` holds features of another encoder or of other episodes.
     """
     longest, wanted = int(episodes.lengths.max()), (args.clip - 1) * args.stride + 1

@@ -114,7 +114,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
-        DinoWeightsError: if the weights of the parser's frozen encoder are missing.
+        WeightsError: if the weights of the parser's frozen encoder are missing.
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
     single = args.clip == 1  # on single frames the transition takes no part

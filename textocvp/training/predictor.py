@@ -25,13 +25,14 @@ from torch import Tensor, nn
 from textocvp.checkpoint import resolve_checkpoint
 from textocvp.config import with_settings
 from textocvp.data.cache import FrameCache, cached_slots
-from textocvp.data.episodes import Episodes, open_episodes
+from textocvp.data.episodes import Episodes, words_of
 from textocvp.data.slot_batches import SlotBatches, padded, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
 from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import TextEncoder, WordBatch
+from textocvp.text.words import WordsConfig
 from textocvp.training.evaluate_predictor import (
     InstructionFollowing,
     SlotErrors,
@@ -219,10 +220,11 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     """
     accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
-    with open_episodes(args.data, args.episodes) as episodes:
-        model = assemble(args, episodes.instructions).to(accelerator.device)
-    layout, causal = model.config.parser.layout, model.config.predictor.attention == "causal"
-    with open_data(args, model.config.parser.image_size, "parser.image_size") as (episodes, held_out):
+    with resolve_checkpoint(str(args.parser)) as folder:
+        trained = TextOCVP.from_pretrained(folder)
+    with open_data(args, trained.config.parser.image_size, "parser.image_size") as (episodes, held_out):
+        model = assemble(args, trained, episodes.instructions, episodes.vocabulary).to(accelerator.device)
+        layout, causal = model.config.parser.layout, model.config.predictor.attention == "causal"
         share = (accelerator.process_index, accelerator.num_processes)
         slots = cached_slots(model, episodes, args.out / "slots-train", *share)
         val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
@@ -260,18 +262,20 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     return metrics
 
 
-def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
+def assemble(
+    args: PredictorTraining, trained: TextOCVP, captions: Iterable[str] = (), vocabulary: Iterable[str] = ()
+) -> TextOCVP:
     """A model with the trained parser and renderer, frozen, and a text encoder and a predictor to train.
 
     Args:
-        captions: what a new text encoder is trained on.
+        trained: the checkpoint `args.parser`.
+        captions: what the text encoder will learn from.
+        vocabulary: further words that a new text encoder must have a place for.
 
     Raises:
         SettingsError: if an option would change the architecture of what is to be fine-tuned (but for a longer window),
             or of the parser.
     """
-    with resolve_checkpoint(str(args.parser)) as folder:
-        trained = TextOCVP.from_pretrained(folder)
     if args.finetune:
         if args.preset is not None:
             raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
@@ -279,6 +283,13 @@ def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
             raise SettingsError(f"{args.parser} has no trained predictor to finetune: leave out finetune")
         with allowed_settings():
             extend_window(trained, args.set)
+        if isinstance(
+            trained.config.text, WordsConfig
+        ):  # words that these captions have are trained from now on
+            met = words_of(captions)
+            left = tuple(word for word in trained.config.text.untrained if word not in met)
+            trained.text.config = replace(trained.config.text, untrained=left)
+            trained.config = replace(trained.config, text=trained.text.config)
         trained.text.train()
         trained.predictor.train()
         for part in (trained.parser, trained.renderer):
@@ -295,7 +306,7 @@ def assemble(args: PredictorTraining, captions: Iterable[str] = ()) -> TextOCVP:
             )
     with allowed_settings():
         config = with_settings(config, args.set)
-        text = config.text.for_captions(captions)
+        text = config.text.for_captions(captions, vocabulary)
         model = TextOCVP(replace(config, text=text, stage="predictor"))
     for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
         part.load_state_dict(source.state_dict())

@@ -11,11 +11,11 @@ import torch
 from tests.textocvp.conftest import PLACED, build
 from tests.textocvp.slot_scenes import LAYOUT, scenes
 from tests.textocvp.toy_episodes import write_toy_episodes
-from textocvp.config import TextConfig
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.slots import SlotState
 from textocvp.text import build_text_encoder
+from textocvp.text.words import WordsConfig
 
 
 def batches(text=None, **changes) -> SlotBatches:
@@ -37,7 +37,7 @@ def test_recoloring_permutes_scene_and_words_alike():
 
 def test_words_without_rgb_stop_all_recoloring() -> None:
     """Else "red" would be taught to mean whatever colour the red block was given."""
-    text = build_text_encoder(TextConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    text = build_text_encoder(WordsConfig(kind="transformer", dim=16, heads=2, hidden=16))
     a, b = (batches(text, recolor=recolor).draw(np.random.default_rng(5), 12) for recolor in (False, True))
     assert torch.equal(a.slots_BTKD, b.slots_BTKD)
     assert torch.equal(b.channels_B3, torch.arange(3).expand(12, 3))  # the frames of an image loss stay, too

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -74,7 +75,7 @@ def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(folder: Pat
     args = run(folder, PLACED, "run")
     for setting, words in (
         ("text.kind=transformer", r"set predictor\.color_bias=false"),
-        ("predictor.layer=2", r"unknown setting 'predictor\.layer'"),
+        ("predictor.layer=2", "predictor has no field 'layer'"),
         ("predictor.heads=3", "heads"),
     ):
         with pytest.raises(SettingsError, match=words):
@@ -130,6 +131,25 @@ def test_frames_and_captions_are_enough(folder: Path, config: ModelConfig, capsy
     assert isinstance(metrics, SlotErrors) and metrics.error is not None
     assert capsys.readouterr().out.count("no instruction following") == 3
     assert json.loads((args.out / "slot_errors.json").read_text())["error"]["value"] == metrics.error.value
+
+
+def test_words_come_from_the_training_file(folder: Path) -> None:
+    """Of its vocabulary those that no caption contains are known to be untrained."""
+    with h5py.File(folder / "train.h5", "a") as file:
+        file.attrs["vocabulary"] = json.dumps(["put", "the", "block", "in", "bowl", "red", "beside"])
+        file["episode/instruction"][0] = "push the red block"
+    args = run(folder, PLACED, "out", steps=1)
+    train(args)
+    text = TextOCVP.from_pretrained(args.out / "checkpoint").config.text
+    assert set(text.vocabulary) == {*PLACED.text.vocabulary, "beside", "push"}  # red has its RGB
+    assert "beside" in text.untrained and not {"push", "put", "bowl"} & set(text.untrained)
+
+    with h5py.File(folder / "train.h5", "a") as file:
+        file["episode/instruction"][1] = "put the red block beside the blue bowl"
+    tuned = replace(args, parser=args.out / "checkpoint", out=folder / "tuned", finetune=True)
+    train(tuned)
+    after = TextOCVP.from_pretrained(tuned.out / "checkpoint").config.text
+    assert after.vocabulary == text.vocabulary and set(text.untrained) - set(after.untrained) == {"beside"}
 
 
 def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained() -> None:
