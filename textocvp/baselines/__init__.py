@@ -3,7 +3,9 @@
 A class here is a `textocvp.protocols.VideoModel` with a class method `from_folder(folder, name, device)`.
 """
 
+from typing import Any
+
 from textocvp.baselines.mage import MageVideoModel
 
-BASELINES = {"mage": MageVideoModel}
-"""What `architecture` says in the `config.json` of a checkpoint -> the class that loads it."""
+BASELINES: dict[str, Any] = {"mage": MageVideoModel}
+"""The field `architecture` in the `config.json` of a checkpoint -> the class that loads it."""

@@ -82,10 +82,12 @@ def _kernels(x_ND: np.ndarray, y_MD: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _discrepancy(kernels: tuple[np.ndarray, ...], a_SN: np.ndarray, b_SM: np.ndarray) -> np.ndarray:
     """(S,) for S pairs of weightings of the two sets."""
     own, other, between = kernels
-    parts = [np.einsum("sn,nm,sm->s", a, k, b, optimize=True)
-             for a, k, b in ((a_SN, own, a_SN), (b_SM, other, b_SM), (a_SN, between, b_SM))]  # fmt: skip
-    # Never below 0 but by rounding.
-    return 100 * np.maximum(parts[0] + parts[1] - 2 * parts[2], 0.0)
+
+    def mean(a: np.ndarray, kernel: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("sn,nm,sm->s", a, kernel, b, optimize=True)
+
+    found_S = mean(a_SN, own, a_SN) + mean(b_SM, other, b_SM) - 2 * mean(a_SN, between, b_SM)
+    return 100 * np.maximum(found_S, 0.0)  # never below 0 but by rounding
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from textocvp.text import ENCODERS
 from textocvp.text.base import TextEncoder, TextTokens, WordBatch
 from textocvp.text.words import GRAMMAR, PAD, TRAIN_COLORS, UNKNOWN, WordEncoder, WordsConfig
 
-FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding
+FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding: no word here stands for all colours
 
 
 @dataclass(frozen=True)
