@@ -17,9 +17,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.baselines.mage.config import ARCHITECTURE as MAGE
-from textocvp.baselines.mage.config import MAGE_PRESETS, MageConfig, mage_preset
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS, Mage, MageConfig, mage_preset
+from textocvp.baselines.mage.model import ARCHITECTURE as MAGE
 from textocvp.checkpoint import (
     CONFIG_FILE,
     DEFAULT_CHECKPOINT,

@@ -8,8 +8,7 @@ import pytest
 
 from tests.textocvp.conftest import PLACED
 from textocvp import cli
-from textocvp.baselines.mage.config import MAGE_PRESETS
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS, Mage
 from textocvp.cli import ListedModel, list_models
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS

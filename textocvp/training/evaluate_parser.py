@@ -13,9 +13,7 @@ import numpy as np
 import torch
 
 from textocvp.data.episodes import Episodes
-from textocvp.metrics.frames import psnr
-from textocvp.metrics.intervals import Interval, bootstrap_interval
-from textocvp.metrics.masks import FIRST_OBJECT, followed, foreground_ari, object_ious
+from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.training.run import Metrics
@@ -97,17 +95,17 @@ def measure_parser(
         if truth is None or truth.segmentation is None:
             continue
         labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
-        # The robot is not an object: as background it matches nothing. Object labels count from FIRST_OBJECT.
-        nothing = np.isin(truth.segmentation, [0] if truth.robot is None else [0, truth.robot])
-        objects = np.where(nothing, 0, truth.segmentation.astype(np.int64) + FIRST_OBJECT)
+        # All that is neither background nor robot is an object.
+        segmentation = truth.segmentation
+        objects = [label for label in np.unique(segmentation).tolist() if label not in (0, truth.robot)]
         times = range(0, len(labels), frame_step)
-        matches = np.concatenate([object_ious(labels[t], objects[t]).ious for t in times])
+        matches = np.concatenate([object_ious(labels[t], segmentation[t], objects).ious for t in times])
         if len(matches) == 0:  # nothing but background
             continue
         ious.append(matches.mean())
         found.append((matches > 0.5).mean())
-        follows.append(followed(labels, objects).mean())
-        aris.append(np.mean([foreground_ari(labels[t], truth.segmentation[t]) for t in times]))
+        follows.append(followed(labels, segmentation, objects).mean())
+        aris.append(np.mean([foreground_ari(labels[t], segmentation[t]) for t in times]))
     miou, share, kept, ari = (
         bootstrap_interval(values) if not np.isnan(values).all() else None
         for values in (ious, found, follows, aris)

@@ -12,7 +12,9 @@ from unittest.mock import patch
 from tests.textocvp.conftest import PLACED, PUBLISHED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
-from textocvp.baselines.mage.config import MAGE_PRESETS, AxialConfig, MageConfig, VQVAEConfig
+from textocvp.baselines.mage import MAGE_PRESETS, MageConfig
+from textocvp.baselines.mage.axial import AxialConfig
+from textocvp.baselines.mage.vqvae import VQVAEConfig
 from textocvp.presets import PRESETS
 from textocvp.training import run as training
 

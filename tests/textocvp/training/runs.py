@@ -1,7 +1,8 @@
-"""Short runs of both stages on toy episodes, and what they left."""
+"""Short runs of the stages on toy episodes, and what they left."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,10 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.textocvp.conftest import PLACED, PUBLISHED
-from textocvp.training import parser, predictor
 from textocvp.training import run as training
 from textocvp.training.parser import ParserTraining
 from textocvp.training.predictor import PredictorTraining
+from textocvp.training.run import TrainingSettings
 
 
 def parser_run(folder: Path, out: str, **changes) -> ParserTraining:
@@ -26,11 +27,12 @@ def predictor_run(folder: Path, out: str, **changes) -> PredictorTraining:
     return PredictorTraining(folder / "train.h5", folder / "val.h5", folder / out, **(settings | changes))
 
 
-def train(args: ParserTraining | PredictorTraining):
-    return parser.train(args) if isinstance(args, ParserTraining) else predictor.train(args)
+def train(args: TrainingSettings):
+    """Run the stage whose settings these are."""
+    return import_module(type(args).__module__).train(args)
 
 
-def train_killed_after(args: ParserTraining | PredictorTraining, step: int) -> None:
+def train_killed_after(args: TrainingSettings, step: int) -> None:
     """Train with a state saved after every update, and die when that of `step` is saved."""
     save = training.save_state
 

@@ -17,12 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from textocvp.baselines.mage.checkpoint import save_vqvae
-from textocvp.baselines.mage.config import mage_preset
-from textocvp.baselines.mage.vqvae import VQVAE, perplexity
+from textocvp.baselines.mage.presets import mage_preset
+from textocvp.baselines.mage.vqvae import VQVAE, perplexity, save_vqvae
 from textocvp.config import with_settings
 from textocvp.data.episodes import Episodes
-from textocvp.metrics.frames import psnr
+from textocvp.metrics import psnr
 from textocvp.parsers.base import to_frames
 from textocvp.training.clips import Clips, ClipTraining, clip_reader, save_samples, to_pictures
 from textocvp.training.losses import thing_weights
@@ -86,13 +85,14 @@ class CodeUses:
 
 
 def train(args: VQVAETraining) -> ReconstructionMetrics | None:
-    """Run or continue stage 1; writes `out`/checkpoint and returns the figures on the held-out episodes.
+    """Run or continue stage 1; writes `out`/checkpoint.
 
-    They are None on all processes but the main one.
+    Returns:
+        the metrics of all held-out episodes; None on all processes but the main one.
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
-        DinoWeightsError: if the weights of a frozen encoder are missing.
+        WeightsError: if the weights of a frozen encoder are missing.
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
     accelerator = open_run(args.out, args.precision)
@@ -117,10 +117,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
             whole = run.total(weights_BT1HW.sum())
             counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64, device=run.device)
             for part in run.micro_batches():
-                frames_N3HW, weights_N1HW = (
-                    frames_BT3HW[part].flatten(0, 1),
-                    weights_BT1HW[part].flatten(0, 1),
-                )
+                frames_N3HW, weights_N1HW = (x[part].flatten(0, 1) for x in (frames_BT3HW, weights_BT1HW))
                 known = () if features_BTLF is None else (features_BTLF[part].flatten(0, 1),)
                 with accelerator.autocast():
                     drawn_N3HW, found = run.module(frames_N3HW, *known)
@@ -143,28 +140,25 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
 
 
 @torch.no_grad()
-def restart_codes(model: VQVAE, uses: CodeUses, clips: Clips, seed: int) -> int:
-    """Put the unused codes onto features of these frames and begin to count anew; how many there were."""
-    device = model.codebook.codes_KC.device
-    frames_BT3HW, features_BTLF = clips.on(device)
-    known = () if features_BTLF is None else (features_BTLF.flatten(0, 1),)
-    features_XC = model.features(frames_BT3HW.flatten(0, 1), *known).flatten(0, 2)
+def restart_codes(model: VQVAE, uses: CodeUses, clips: Clips, seed: int) -> None:
+    """Put the unused codes onto features of these frames and begin to count anew."""
+    frames_BT3HW, features_BTLF = clips.on(model.device)
+    known = None if features_BTLF is None else features_BTLF.flatten(0, 1)
+    features_XC = model.features(frames_BT3HW.flatten(0, 1), known).flatten(0, 2)
     generator = torch.Generator().manual_seed(seed)
-    moved = model.codebook.restart((uses.counts_K == 0).to(device), features_XC, generator)
+    model.codebook.restart((uses.counts_K == 0).to(model.device), features_XC, generator)
     uses.counts_K = torch.zeros_like(uses.counts_K)
-    return moved
 
 
 @torch.no_grad()
 def measure(
     model: VQVAE, episodes: Episodes, chosen: Iterable[int], frame_step: int = 3
 ) -> ReconstructionMetrics:
-    """Figures over every so many-th frame of some episodes."""
-    device = model.codebook.codes_KC.device
+    """Metrics of every `frame_step`-th frame of some episodes."""
     ratios, errors, weights = [], [], []
     counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64)
     for index in chosen:
-        frames_N3HW = to_frames(episodes.frames(index)[None, ::frame_step], device)[0]
+        frames_N3HW = to_frames(episodes.frames(index)[None, ::frame_step], model.device)[0]
         codes_Nhw = model.encode(frames_N3HW)
         counts_K += codes_Nhw.flatten().bincount(minlength=len(counts_K)).cpu()
         real, drawn = (frames_N3HW + 1) / 2, (model.decode(codes_Nhw).clamp(-1, 1) + 1) / 2
@@ -188,4 +182,4 @@ def draw_samples(model: VQVAE, episodes: Episodes, path: Path) -> None:
     def redraw(index: int, frames_T3HW: Tensor, times: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         return [to_pictures(model.decode(model.encode(frames_T3HW[times])))]
 
-    save_samples(path, episodes, redraw, model.codebook.codes_KC.device)
+    save_samples(path, episodes, redraw, model.device)
