@@ -19,8 +19,8 @@ from textocvp.baselines.mage.train_mage import MageTraining, cached_codes
 from textocvp.baselines.mage.train_vqvae import VQVAETraining
 from textocvp.baselines.mage.vqvae import VQVAE, load_vqvae
 from textocvp.checkpoint import CheckpointError
+from textocvp.data import open_episodes
 from textocvp.data.cache import CacheError
-from textocvp.data.episodes import open_episodes
 from textocvp.training.run import SettingsError
 
 
