@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -63,48 +62,43 @@ class ParserStage(nn.Module):
         super().__init__()
         self.parser, self.renderer = model.parser, model.renderer
 
-    def forward(self, frames_BT3HW: Tensor, weights_N1HW: Tensor, **portion: Any) -> ParserLoss:
-        """See `parser_loss`."""
-        return parser_loss(self, frames_BT3HW, weights_N1HW, **portion)
+    def forward(
+        self,
+        frames_BT3HW: Tensor,
+        weights_N1HW: Tensor,
+        *,
+        whole: Tensor | None = None,
+        weight: float = 1.0,
+        generator: Sequence[torch.Generator] | None = None,
+        features_BTLF: Tensor | None = None,
+    ) -> ParserLoss:
+        """The terms of stage 1 for clips in -1..1, or what a micro-batch adds to those of the batch.
 
-
-def parser_loss(
-    model: TextOCVP | ParserStage,
-    frames_BT3HW: Tensor,
-    weights_N1HW: Tensor,
-    *,
-    whole: Tensor | None = None,
-    weight: float = 1.0,
-    generator: Sequence[torch.Generator] | None = None,
-    features_BTLF: Tensor | None = None,
-) -> ParserLoss:
-    """The terms of stage 1 for clips in -1..1, or what a micro-batch adds to those of the batch.
-
-    Args:
-        weights_N1HW: how much each pixel of the N = B * T frames counts, see `thing_weights`.
-        whole: the sum of those weights over the whole batch; None for clips that are a whole batch.
-        weight: how much of the batch these clips are.
-        generator: for parsers that draw their first slots, one for each clip.
-        features_BTLF: of the parser's frozen encoder, where they are known already.
-    """
-    known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
-    parsed = model.parser(frames_BT3HW, generator=generator, **known)
-    target = frames_BT3HW.flatten(0, 1)
-    slots_NKD, attention_NKHW = parsed.slots_BTKD.flatten(0, 1), parsed.attention_BTKHW.flatten(0, 1)
-    rendered = model.renderer(slots_NKD)
-    mask = place = feature = target.new_zeros(())
-    places = model.renderer.places(slots_NKD)
-    if places is not None:
-        place = read_place_loss(*places, attention_NKHW)
-    if parsed.expected_BTKD is not None:
-        layout = model.parser.layout
-        mask = mask_loss(rendered, attention_NKHW, weights_N1HW, whole)
-        found = SlotState.split(parsed.slots_BTKD[:, 1:], layout)
-        place = place_loss(SlotState.split(parsed.expected_BTKD, layout), found)
-    if rendered.features_BLF is not None and parsed.features_BTLF is not None:
-        feature = F.mse_loss(rendered.features_BLF, parsed.features_BTLF.flatten(0, 1))
-    image = image_loss(rendered, target, weights_N1HW, whole)
-    return ParserLoss(image, mask, weight * place, weight * feature)
+        Args:
+            weights_N1HW: how much each pixel of the N = B * T frames counts, see `thing_weights`.
+            whole: the sum of those weights over the whole batch; None for clips that are a whole batch.
+            weight: how much of the batch these clips are.
+            generator: for parsers that draw their first slots, one for each clip.
+            features_BTLF: of the parser's frozen encoder, where they are known already.
+        """
+        known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
+        parsed = self.parser(frames_BT3HW, generator=generator, **known)
+        target = frames_BT3HW.flatten(0, 1)
+        slots_NKD, attention_NKHW = parsed.slots_BTKD.flatten(0, 1), parsed.attention_BTKHW.flatten(0, 1)
+        rendered = self.renderer(slots_NKD)
+        mask = place = feature = target.new_zeros(())
+        places = self.renderer.places(slots_NKD)
+        if places is not None:
+            place = read_place_loss(*places, attention_NKHW)
+        if parsed.expected_BTKD is not None:
+            layout = self.parser.layout
+            mask = mask_loss(rendered, attention_NKHW, weights_N1HW, whole)
+            found = SlotState.split(parsed.slots_BTKD[:, 1:], layout)
+            place = place_loss(SlotState.split(parsed.expected_BTKD, layout), found)
+        if rendered.features_BLF is not None and parsed.features_BTLF is not None:
+            feature = F.mse_loss(rendered.features_BLF, parsed.features_BTLF.flatten(0, 1))
+        image = image_loss(rendered, target, weights_N1HW, whole)
+        return ParserLoss(image, mask, weight * place, weight * feature)
 
 
 def train(args: ParserTraining) -> ParserMetrics | None:

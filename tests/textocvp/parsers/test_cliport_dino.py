@@ -33,7 +33,7 @@ from textocvp.slots import SlotLayout
 from textocvp.training import parser as train_parser
 from textocvp.training import predictor as train_predictor
 from textocvp.training.losses import thing_weights
-from textocvp.training.parser import ParserTraining, parser_loss
+from textocvp.training.parser import ParserStage, ParserTraining
 from textocvp.training.predictor import PredictorTraining
 from textocvp.training.run import SettingsError
 from textocvp.world_model import WorldModel
@@ -133,14 +133,14 @@ def test_slots_are_exchangeable(weights: Path) -> None:
 def test_stage_one_learns_from_pixels_and_from_features_unclamped(weights: Path) -> None:
     model = build(weights)
     clips = frames()
-    loss = parser_loss(model, clips, thing_weights(clips.flatten(0, 1), 0.0))
+    loss = ParserStage(model)(clips, thing_weights(clips.flatten(0, 1), 0.0))
     parsed = model.parser(clips)
     assert parsed.features_BTLF is not None and parsed.features_BTLF.abs().max() > 1
     zero = build(weights)
     with torch.no_grad():
         for parameter in zero.renderer.parameters():
             parameter.zero_()
-    nothing = parser_loss(zero, clips, thing_weights(clips.flatten(0, 1), 0.0))
+    nothing = ParserStage(zero)(clips, thing_weights(clips.flatten(0, 1), 0.0))
     # A renderer that draws zeros errs by the mean square of what it should draw.
     torch.testing.assert_close(nothing.feature, parsed.features_BTLF.square().mean())
     torch.testing.assert_close(nothing.image, clips.square().mean())

@@ -15,7 +15,7 @@ from textocvp.data.episodes import EpisodeFile
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.training.losses import thing_weights
-from textocvp.training.parser import ParserTraining, parser_loss
+from textocvp.training.parser import ParserStage, ParserTraining
 from textocvp.training.run import SettingsError
 
 
@@ -42,7 +42,7 @@ def test_training_lowers_the_loss_and_leaves_the_second_stage_alone(folder: Path
     with EpisodeFile(args.val) as episodes, torch.no_grad():
         frames = to_frames(episodes.frames(0)[None, :4])
         weights = thing_weights(frames.flatten(0, 1), args.thing_weight)
-        first, last = (parser_loss(model, frames, weights) for model in (before, after))
+        first, last = (ParserStage(model)(frames, weights) for model in (before, after))
     assert last.image < 0.5 * first.image and last.mask < 0.9 * first.mask
     for part in ("text", "predictor"):
         old, new = getattr(before, part).state_dict(), getattr(after, part).state_dict()
