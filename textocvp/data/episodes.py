@@ -111,11 +111,11 @@ class Episodes(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """A hash of what the episodes are, by which caches know them: of sentences, lengths and first frames."""
+        """A hash of what the episodes are, by which caches know them: of sentences, lengths and some first frames."""
         digest = hashlib.sha256("\n".join(self.instructions).encode())
         digest.update(np.ascontiguousarray(self.lengths, np.int64).tobytes())
-        for at in range(0, len(self), 64):
-            digest.update(self.clips(self.starts[at : at + 64], 1).tobytes())
+        some = self.starts[:: max(1, len(self) // 256)]  # all would take minutes in a large file
+        digest.update(self.clips(some, 1).tobytes())
         return digest.hexdigest()
 
     @property

@@ -84,7 +84,7 @@ def test_trials_ask_and_judge() -> None:
     assert asked([BLUE], {7: 1, 8: 2}).wrong_text == []  # there is nothing else to ask
 
 
-def test_an_object_on_another_is_told_from_it_by_its_size() -> None:
+def test_size_separates_an_object_from_the_one_that_it_lies_on() -> None:
     slots = true_slots(1)[0, 0]
     state = SlotState.split(slots, LAYOUT)
     state.position[3] = state.position[2]

@@ -87,7 +87,7 @@ def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(folder: Pat
     assert not list(args.out.glob("slots-*"))
 
 
-def test_nothing_teaches_a_text_encoder_that_nobody_hears(folder: Path) -> None:
+def test_nothing_trains_a_text_encoder_that_no_predictor_uses(folder: Path) -> None:
     train(run(folder, OCVP_SEQ, "short", steps=1))
     train(run(folder, OCVP_SEQ, "long", steps=3))
     a, b = (weights(run(folder, OCVP_SEQ, name).out) for name in ("short", "long"))
@@ -159,7 +159,7 @@ def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained() -
         return [schedule(args, causal, step, 25, np.random.default_rng(step)) for step in range(1000)]
 
     ours = schedules(causal=True)
-    assert all(lesson == (24, 0) for lesson in ours[:600])
+    assert all(each == (24, 0) for each in ours[:600])
     assert max(imagined for _, imagined in ours[600:615]) <= 4
     assert (1, 23) in ours[930:]
     assert all(given + imagined == 24 for given, imagined in ours)
