@@ -81,7 +81,7 @@ def main(args: Args) -> bool:
     torch.set_num_threads(1)
     console = Console()
     with EpisodeFile(args.data) as episodes:
-        if episodes.split != "val":
+        if episodes.split != "val" or episodes.seeds is None:
             raise ValueError(f"calibration belongs to the val split, {args.data} holds {episodes.split!r}")
         camera = PinholeCamera(
             episodes.attribute("camera_intrinsics"), episodes.attribute("camera_extrinsics")
@@ -104,7 +104,10 @@ def measure_episodes(episodes: EpisodeFile, camera: PinholeCamera, console: Cons
         if not episode.success:
             continue
         labels_THW = torch.from_numpy(episode.segmentation)
-        block, target = episode.target
+        played = episode.question(episode.instruction)
+        if played is None:
+            raise ValueError(f"{episodes.path} has no questions: collect the episodes again")
+        block, target = played.moves, played.ends_at
         arm_THW, block_THW = labels_THW == ARM, labels_THW == FIRST_OBJECT + block
         frames = tuple(range(len(labels_THW)))
         held_T = arm_block_distance(arm_THW, block_THW)

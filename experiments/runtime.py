@@ -55,7 +55,7 @@ from experiments.protocol.timing import machine_in_words, other_load, race
 from experiments.protocol.workers import available_cores
 from experiments.reporting import Results, StudyProgress
 from planning import AppearanceGrounder, Instruction, PinholeCamera
-from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.baselines.mage import MageVideoModel
 from textocvp.world_model import WorldModel
 
 MAGE = "MAGE"

@@ -37,8 +37,8 @@ from experiments.protocol.ablation_runs import (
 )
 from experiments.reporting import Cell, Table, TableRow
 from textocvp.checkpoint import CheckpointError
+from textocvp.data.cache import cached_slots
 from textocvp.data.episodes import EpisodeFile
-from textocvp.data.slot_cache import SlotCacheError, cached_slots
 from textocvp.model import TextOCVP
 from textocvp.training.parser import ParserTraining
 from textocvp.training.parser import train as train_parser
@@ -46,7 +46,7 @@ from textocvp.training.predictor import PredictorTraining
 from textocvp.training.predictor import train as train_predictor
 from textocvp.world_model import DEFAULT_CHECKPOINT, bundled_checkpoints
 
-SLOTS = ("slots-train.h5", "slots-val.h5")  # as `textocvp.training.run.predictor` names them
+SLOTS = ("slots-train", "slots-val")  # as `textocvp.training.predictor` names them
 
 
 @dataclass
@@ -160,7 +160,7 @@ def share_slots(parser: Path, args: Args, out: Path) -> None:
     """Put the slots of all episodes into a run's folder; they are parsed for the first run only.
 
     Raises:
-        SlotCacheError: if the shared slots are those of another parser or of other episodes.
+        CacheError: if the shared slots are those of another parser or of other episodes.
     """
     shared = args.out / "slots"
     model = TextOCVP.from_pretrained(parser)
@@ -168,11 +168,15 @@ def share_slots(parser: Path, args: Args, out: Path) -> None:
     for name, path, first in zip(SLOTS, (args.data, args.val), (args.episodes, None), strict=True):
         with EpisodeFile(path, first=first) as episodes:
             cached_slots(model, episodes, shared / name)
-        (out / name).unlink(missing_ok=True)
-        try:
-            os.link(shared / name, out / name)
-        except OSError:  # a file system without hard links
-            shutil.copyfile(shared / name, out / name)
+        shutil.rmtree(out / name, ignore_errors=True)
+        shutil.copytree(shared / name, out / name, copy_function=_link)
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without hard links
+        shutil.copyfile(source, target)
 
 
 def parser_folder(name: str, stack: ExitStack) -> Path:
@@ -206,7 +210,7 @@ if __name__ == "__main__":
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyError as error:
         sys.exit(f"error: {error.args[0]}")
-    except (OSError, SlotCacheError, CheckpointError, ValueError) as error:
+    except (OSError, CheckpointError, ValueError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("stopped; start it again to go on")

@@ -17,9 +17,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
 
-from textocvp.baselines.mage.config import ARCHITECTURE as MAGE
-from textocvp.baselines.mage.config import MAGE_PRESETS, MageConfig, mage_preset
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS, Mage, MageConfig, mage_preset
+from textocvp.baselines.mage.model import ARCHITECTURE as MAGE
 from textocvp.checkpoint import (
     CONFIG_FILE,
     DEFAULT_CHECKPOINT,
@@ -140,9 +139,8 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _train(arguments: list[str]) -> None:
     # Imported here because training brings libraries that take seconds to load.
     from textocvp.baselines.mage import train_mage, train_vqvae
-    from textocvp.data.episodes import EpisodeFile
-    from textocvp.data.feature_cache import FeatureCacheError
-    from textocvp.data.slot_cache import SlotCacheError
+    from textocvp.data import open_episodes
+    from textocvp.data.cache import CacheError
     from textocvp.training import parser as train_parser
     from textocvp.training import predictor as train_predictor
     from textocvp.training.run import SettingsError
@@ -166,8 +164,8 @@ def _train(arguments: list[str]) -> None:
         if chosen.preset is not None:
             of_mage = isinstance(chosen, (train_vqvae.VQVAETraining, train_mage.MageTraining))
             with_settings((mage_preset if of_mage else preset)(chosen.preset), chosen.set)
-        EpisodeFile(chosen.data, first=chosen.episodes).close()
-        EpisodeFile(chosen.val).close()
+        open_episodes(chosen.data, chosen.episodes).close()
+        open_episodes(chosen.val).close()
     except KeyError as error:
         raise Mistake(error.args[0]) from error
     except (OSError, ValueError) as error:
@@ -180,7 +178,7 @@ def _train(arguments: list[str]) -> None:
     }
     try:
         train[type(chosen)](chosen)
-    except (SettingsError, SlotCacheError, FeatureCacheError, WeightsError) as error:
+    except (SettingsError, CacheError, WeightsError) as error:
         raise Mistake(str(error)) from error
 
 

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.baselines.mage.config import ARCHITECTURE
-from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.baselines import BASELINES
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, read_json, resolve_checkpoint
 from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
@@ -110,6 +109,7 @@ def load_model(
     """The model of a checkpoint of any architecture; arguments and errors as `WorldModel.from_pretrained`."""
     name = str(name_or_folder_or_hub_id)
     with resolve_checkpoint(name) as folder:
-        if read_json(folder).get("architecture") == ARCHITECTURE:
-            return MageVideoModel.from_folder(folder, name, device)
+        architecture = read_json(folder).get("architecture")
+        if architecture in BASELINES:
+            return BASELINES[architecture].from_folder(folder, name, device)
     return WorldModel.from_pretrained(name, device)

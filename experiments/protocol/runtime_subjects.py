@@ -13,9 +13,7 @@ from planning import Grounding, Instruction, Judge, Trace, WeightedSum, measure_
 from planning.planners import watched_frames
 from planning.scores import CarryScore, PlacementScore
 from planning.thresholds import THRESHOLDS
-from textocvp.baselines.mage.config import mage_preset
-from textocvp.baselines.mage.model import Mage
-from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.baselines.mage import Mage, MageVideoModel, mage_preset
 from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
 from textocvp.presets import preset

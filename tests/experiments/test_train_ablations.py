@@ -75,7 +75,7 @@ def test_one_command_trains_all_and_tells_what_failed(args: Args, capsys: pytest
     assert read_config(args.out / "layers-1" / "checkpoint").predictor.layers == 1
     assert find_run(TINY[0], args.out).updates == 2
     # The slots were parsed once: every predictor run has the same file, not a copy.
-    slots = [args.out / folder / "slots-train.h5" for folder in ("slots", "base", "layers-1")]
+    slots = [args.out / folder / "slots-train" / "000000.h5" for folder in ("slots", "base", "layers-1")]
     assert len({os.stat(path).st_ino for path in slots}) == 1
     assert json.loads((args.out / "parser" / "quality.json").read_text())["object_miou"]["n"] == 2
 

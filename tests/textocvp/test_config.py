@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from textocvp.baselines.mage.config import MAGE_PRESETS
+from textocvp.baselines.mage import MAGE_PRESETS
 from textocvp.config import ModelConfig, with_settings
 from textocvp.parsers.savi import SaviConfig
 from textocvp.presets import PRESETS, preset

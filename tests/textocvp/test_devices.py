@@ -7,8 +7,8 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from tests.textocvp.both_stages import MAGE
 from tests.textocvp.conftest import PLACED, PUBLISHED
+from tests.textocvp.training.both_stages import MAGE
 from textocvp.baselines.mage.model import Mage
 from textocvp.baselines.mage.train_mage import MageStage as MageDynamics
 from textocvp.config import ModelConfig
@@ -39,7 +39,7 @@ def test_both_stages_stay_on_the_device(config: ModelConfig) -> None:
     weights = thing_weights(frames, 4.0)
     generators = [torch.Generator().manual_seed(seed) for seed in range(2)]
     redrawing = ParserStage(model)
-    loss = redrawing(frames, weights.flatten(0, 1), whole=weights.sum(), share=0.5, generator=generators)
+    loss = redrawing(frames, weights.flatten(0, 1), whole=weights.sum(), weight=0.5, generator=generators)
     loss.total(0.1, 0.1, 1.0).backward()
     assert {p.grad.device.type for p in redrawing.parameters() if p.grad is not None} == {"meta"}
 

@@ -23,10 +23,9 @@ from textocvp.training.predictor import PredictorStage, PredictorTraining, assem
     ],
     ids=lambda config: f"{config.name}-{config.predictor.kind}",
 )
-def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig, tmp_path: Path) -> None:
-    build(config).save_pretrained(tmp_path)
+def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig) -> None:
     nowhere = Path()
-    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=tmp_path))
+    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=nowhere), build(config))
     frames_B1 = torch.rand(2, 1, 3, 32, 32) * 2 - 1
     frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
     slots_B1KD = model.parser(frames_B1).slots_BTKD

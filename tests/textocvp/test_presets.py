@@ -12,8 +12,7 @@ from tests.textocvp.conftest import PLACED
 from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
-from textocvp.baselines.mage.config import MAGE_PRESETS
-from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage import MAGE_PRESETS, Mage
 from textocvp.cli import ListedModel, list_models
 from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP

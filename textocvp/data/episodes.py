@@ -1,14 +1,13 @@
-"""Reading episode files: whole episodes to look at, random clips to train on.
-
-The files are written by ``python -m envs.collect``; this module knows their layout and nothing of the
-simulator.
-"""
+"""Episodes: frames with a sentence each, and what is known of the scenes. The HDF5 file that holds them."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,44 +18,166 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = "textocvp-episodes"
-FORMAT_VERSION = 1
+FORMAT_VERSIONS = (1, 2)
+
+# What the labels of a segmentation meant before files said so themselves.
+BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
 
 
 class EpisodeObject(NamedTuple):
-    """One object of a scene. In a segmentation, object ``id`` has the label ``2 + id`` (0 is the table, 1 the
-    arm)."""
+    """One object of a scene; `label` is its value in the segmentation."""
 
     id: int
+    label: int
     kind: str
     color: str
 
 
-@dataclass(frozen=True)
-class Episode:
-    """One episode of T frames."""
+class Question(NamedTuple):
+    """A sentence that a scene allows, and the ids of the object that should move and of that at which it should end."""
+
+    text: str
+    moves: int
+    ends_at: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What is known of an episode besides its frames. Used to measure, never to train."""
+
+    segmentation: NDArray[np.uint8] | None = None
+    """(T, H, W) labels, 0 the background; None where there are no masks."""
+    robot: int | None = None
+    """The robot's label, if there is a robot."""
+    objects: tuple[EpisodeObject, ...] = ()
+    questions: tuple[Question, ...] = ()
+
+    def question(self, text: str) -> Question | None:
+        """The question with this sentence, if there is one."""
+        return next((question for question in self.questions if question.text == text), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode(Truth):
+    """Everything of one episode of T frames."""
 
     frames: NDArray[np.uint8]
-    """(T, H, W, 3), 0..255; frame 0 is seen before the robot moves."""
-    segmentation: NDArray[np.uint8]
-    """(T, H, W): 0 table, 1 arm, 2 + i object i."""
+    """(T, H, W, 3), 0..255; frame 0 is seen before anything moves."""
     instruction: str
-    objects: tuple[EpisodeObject, ...]
-    target: tuple[int, int]
-    """Ids of the named block and of the named bowl."""
-    success: bool
-    """Whether the block ended up in the bowl, as the simulator judged."""
-    seed: int
+    seed: int | None = None
+    """The scene's seed in the simulator, if it has one."""
+    success: bool | None = None
+    """Whether the instruction was carried out, if that was judged."""
 
 
-class EpisodeFile:
-    """An episode file, open for reading.
+class Episodes(ABC):
+    """Episodes of square frames, one after another. Subclasses set the attributes and write `detect` and `frames`.
 
-    Usable as a context manager; picklable, and safe to use after a fork: each process opens the file for
-    itself.
+    Must be picklable, and usable after a fork: workers read clips ahead.
+
+    Attributes:
+        path: where they are.
+        image_size: height and width of the frames, in pixels.
+        lengths: (E,) frames of each episode.
+        instructions: the E sentences.
+    """
+
+    path: Path
+    image_size: int
+    lengths: NDArray[np.int64]
+    instructions: tuple[str, ...]
+
+    @abstractmethod
+    def __init__(self, path: str | os.PathLike[str], first: int | None = None) -> None:
+        """Open what is at `path`; with `first`, as if there were only the first so many episodes."""
+
+    @classmethod
+    @abstractmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether what is at `path` is of this format, by a quick look."""
+
+    @abstractmethod
+    def frames(self, index: int) -> NDArray[np.uint8]:
+        """All frames (T, H, W, 3) of an episode, 0..255."""
+
+    def truth(self, index: int) -> Truth | None:
+        """What is known of an episode; None where nothing is."""
+        return None
+
+    @property
+    def vocabulary(self) -> tuple[str, ...]:
+        """The words that sentences about such scenes can contain; by default those of the instructions."""
+        return tuple(sorted(words_of(self.instructions)))
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of what the episodes are, by which caches know them: of sentences, lengths and some first frames."""
+        digest = hashlib.sha256("\n".join(self.instructions).encode())
+        digest.update(np.ascontiguousarray(self.lengths, np.int64).tobytes())
+        some = self.starts[:: max(1, len(self) // 256)]  # all would take minutes in a large file
+        digest.update(self.clips(some, 1).tobytes())
+        return digest.hexdigest()
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """(E,) number of each episode's first frame, counted over all episodes."""
+        return np.cumsum(self.lengths) - self.lengths
+
+    def clips(self, starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
+        """Clips (len(starts), length, H, W, 3) that begin at these frames, counted over all episodes."""
+        episodes = np.searchsorted(self.starts, starts, side="right") - 1
+        offsets = starts - self.starts[episodes]
+        pairs = zip(episodes, offsets, strict=True)
+        return np.stack([self.frames(int(index))[at : at + length] for index, at in pairs])
+
+    def random_starts(self, rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
+        """Where random clips of `length` frames begin (count,); every clip of the episodes is equally likely.
+
+        Raises:
+            ValueError: when no episode is that long.
+        """
+        if count < 1 or length < 1:
+            raise ValueError(f"count and length must be at least 1, not {count} and {length}")
+        # An episode of T frames has T - length + 1 clips.
+        ends = np.cumsum(np.maximum(self.lengths - length + 1, 0))
+        if len(self) == 0 or ends[-1] == 0:
+            longest = int(self.lengths.max(initial=0))
+            raise ValueError(f"no episode has {length} frames; the longest of {self.path} has {longest}")
+        picks = rng.integers(ends[-1], size=count)
+        episodes = np.searchsorted(ends, picks, side="right")
+        offsets = picks - (ends[episodes] - np.maximum(self.lengths[episodes] - length + 1, 0))
+        return self.starts[episodes] + offsets
+
+    def close(self) -> None:
+        """Give back what is held open. A later read opens it again."""
+        return
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self.lengths)
+
+    def __enter__(self) -> Episodes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class EpisodeFile(Episodes):
+    """One HDF5 file of format version 1 or 2.
+
+    Only frames, starts, lengths and instructions must be in it; masks, objects, questions, seeds and success may.
 
     Args:
-        path: the HDF5 file.
+        path: the file.
         first: use only the first so many episodes, as if the file held no others.
+
+    Attributes:
+        seeds: (E,) of the scenes, disjoint between splits; None where there are none.
+        success: (E,) whether the instructions were carried out; None where that was not judged.
+        split: name of the split.
 
     Raises:
         FileNotFoundError: when there is no such file.
@@ -71,46 +192,37 @@ class EpisodeFile:
         self._process = -1
         if not self.path.is_file():
             raise FileNotFoundError(
-                f"there is no episode file {self.path}; collect one with: "
-                f"python -m envs.collect --out {self.path}"
+                f"there is no episode file {self.path}; collect one with: python -m envs.collect --out {self.path}"
             )
         try:
             file = self._open()
-            self._check_format(file)
-            index = file["episode"]
-            self._starts: NDArray[np.int64] = index["start"][:]
+            self._version = self._check_format(file)
+            index, kept = file["episode"], slice(first)
             self.lengths: NDArray[np.int64] = index["length"][:]
-            """(E,) frames of each episode."""
-            self.seeds: NDArray[np.int64] = index["seed"][:]
-            """(E,) seeds, disjoint between splits."""
-            self.success: NDArray[np.bool_] = index["success"][:]
-            """(E,) whether the expert succeeded."""
-            self.instructions: tuple[str, ...] = tuple(index["instruction"].asstr()[:])
-            """The E instructions."""
+            self.instructions: tuple[str, ...] = tuple(index["instruction"].asstr()[kept])
+            self.seeds: NDArray[np.int64] | None = index["seed"][kept] if "seed" in index else None
+            self.success: NDArray[np.bool_] | None = index["success"][kept] if "success" in index else None
             self.image_size = int(file["frames"].shape[1])
-            """Height and width of the frames, in pixels."""
-            self.split = str(file.attrs["split"])
-            """Name of the split."""
-            total = file["frames"].shape[0]
+            self.split = str(file.attrs.get("split", ""))
+            total, consecutive = file["frames"].shape[0], np.array_equal(index["start"][:], self.starts)
         except (OSError, KeyError) as error:
             self.close()
             raise ValueError(f"{self.path} is not an episode file, or is damaged: {error}") from error
         except ValueError:
             self.close()
             raise
-        if total != int(self.lengths.sum()):
+        if total != int(self.lengths.sum()) or not consecutive:
             self.close()
             raise ValueError(
-                f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}"
+                f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}, which must stand "
+                "one episode after another"
             )
-        if first is not None:
-            self._starts, self.lengths = self._starts[:first], self.lengths[:first]
-            self.seeds, self.success = self.seeds[:first], self.success[:first]
-            self.instructions = self.instructions[:first]
+        self.lengths = self.lengths[kept]
 
-    def __len__(self) -> int:
-        """Number of episodes."""
-        return len(self.lengths)
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether it is a file with one of the usual endings, or one that begins as HDF5 does."""
+        return path.is_file() and (path.suffix in (".h5", ".hdf5") or bool(h5py.is_hdf5(path)))
 
     def __repr__(self) -> str:
         size = self.image_size
@@ -120,66 +232,29 @@ class EpisodeFile:
         return (self.episode(index) for index in range(len(self)))
 
     def episode(self, index: int) -> Episode:
-        """Episode number ``index``; negative numbers count from the end.
+        """Everything of episode number ``index``; negative numbers count from the end.
 
         Raises:
             IndexError: when there is no such episode.
         """
-        rows = self._rows(index)
-        file = self._open()
-        number = index % len(self)
-        objects = json.loads(file["episode/objects"].asstr()[number])
-        block, bowl = file["episode/target"][number].tolist()
+        number = self._number(index)
         return Episode(
-            frames=file["frames"][rows],
-            segmentation=file["segmentation"][rows],
+            frames=self.frames(number),
             instruction=self.instructions[number],
-            objects=tuple(EpisodeObject(k, item["kind"], item["color"]) for k, item in enumerate(objects)),
-            target=(block, bowl),
-            success=bool(self.success[number]),
-            seed=int(self.seeds[number]),
+            seed=None if self.seeds is None else int(self.seeds[number]),
+            success=None if self.success is None else bool(self.success[number]),
+            **vars(self.truth(number) or Truth()),
         )
 
-    def frames(self, indices: Sequence[int] | NDArray[np.integer]) -> list[NDArray[np.uint8]]:
-        """The frames of several episodes, each (T, H, W, 3); T may differ between them.
+    def frames(self, index: int) -> NDArray[np.uint8]:
+        """All frames (T, H, W, 3) of an episode.
 
         Raises:
             IndexError: when there is no such episode.
         """
-        return [self._open()["frames"][self._rows(int(index))] for index in indices]
-
-    def random_clips(
-        self, rng: np.random.Generator, count: int, length: int, rows: slice = slice(None)
-    ) -> NDArray[np.uint8]:
-        """Random clips (count, length, H, W, 3); every clip of the file is equally likely.
-
-        Args:
-            rng: the source of chance; the same state gives the same clips.
-            count: how many, at least 1.
-            length: frames of each, at least 1.
-            rows: read only these of the `count` clips, for a process that computes a share of a batch.
-
-        Raises:
-            ValueError: when no episode is that long.
-        """
-        return self.clips(self.random_starts(rng, count, length)[rows], length)
-
-    def random_starts(self, rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
-        """Where random clips start: their first frames' numbers (count,) in the file; as `random_clips`."""
-        if count < 1 or length < 1:
-            raise ValueError(f"count and length must be at least 1, not {count} and {length}")
-        # An episode of T frames has T - length + 1 clips.
-        ends = np.cumsum(np.maximum(self.lengths - length + 1, 0))
-        if len(self) == 0 or ends[-1] == 0:
-            longest = int(self.lengths.max(initial=0))
-            raise ValueError(f"no episode has {length} frames; the longest of {self.path} has {longest}")
-        picks = rng.integers(ends[-1], size=count)
-        episodes = np.searchsorted(ends, picks, side="right")
-        offsets = picks - (ends[episodes] - np.maximum(self.lengths[episodes] - length + 1, 0))
-        return self._starts[episodes] + offsets
+        return self._open()["frames"][self._rows(index)]
 
     def clips(self, starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
-        """Clips (len(starts), length, H, W, 3) that start at these frames of the file."""
         clips = np.empty((len(starts), length, self.image_size, self.image_size, 3), dtype=np.uint8)
         dataset = self._open()["frames"]
         # In the file's order, so that clips of one chunk are read while it is cached.
@@ -187,9 +262,48 @@ class EpisodeFile:
             dataset.read_direct(clips, np.s_[starts[place] : starts[place] + length], np.s_[place])
         return clips
 
+    def truth(self, index: int) -> Truth | None:
+        """Masks, objects and questions, as far as the file has them; None where it has neither.
+
+        Raises:
+            IndexError: when there is no such episode.
+        """
+        number, file = self._number(index), self._open()
+        masks = file["segmentation"][self._rows(number)] if "segmentation" in file else None
+        items = self._json("objects", number)
+        if masks is None and not items:
+            return None
+        if self._version == 1:
+            objects = tuple(
+                EpisodeObject(id, FIRST_OBJECT + id, item["kind"], item["color"])
+                for id, item in enumerate(items)
+            )
+            robot: int | None = ROBOT
+            questions: tuple[Question, ...] = ()
+            if "target" in file["episode"]:
+                moves, ends_at = file["episode/target"][number].tolist()
+                questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
+        else:
+            objects = tuple(
+                EpisodeObject(item["id"], item["label"], item["kind"], item["color"]) for item in items
+            )
+            robot = json.loads(file.attrs.get("labels", "{}")).get("robot")
+            questions = tuple(Question(**item) for item in self._json("questions", number))
+        return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions)
+
+    @property
+    def vocabulary(self) -> tuple[str, ...]:
+        said = self._open().attrs.get("vocabulary")
+        return super().vocabulary if said is None else tuple(json.loads(said))
+
+    @property
+    def fingerprint(self) -> str:
+        digest = hashlib.sha256(str(self._open().attrs.get("config", "")).encode())
+        digest.update(super().fingerprint.encode())
+        return digest.hexdigest()
+
     def attribute(self, name: str) -> Any:
-        """A file attribute, such as `camera_intrinsics` (3, 3), `camera_extrinsics` (4, 4), `config` or
-        `versions`.
+        """A file attribute, such as `camera_intrinsics` (3, 3), `camera_extrinsics` (4, 4) or `config`.
 
         Raises:
             KeyError: for an attribute the file does not have; the message lists those it has.
@@ -208,11 +322,6 @@ class EpisodeFile:
     def __enter__(self) -> EpisodeFile:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_file": None, "_process": -1}
 
@@ -222,18 +331,54 @@ class EpisodeFile:
             self._file, self._process = h5py.File(self.path, "r"), os.getpid()
         return self._file
 
-    def _rows(self, index: int) -> slice:
+    def _number(self, index: int) -> int:
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path} has episodes 0 to {len(self) - 1}, not {index}")
-        start = int(self._starts[index])
-        return slice(start, start + int(self.lengths[index]))
+        return index % len(self)
 
-    def _check_format(self, file: h5py.File) -> None:
+    def _rows(self, index: int) -> slice:
+        number = self._number(index)
+        return slice(int(self.starts[number]), int(self.starts[number] + self.lengths[number]))
+
+    def _json(self, name: str, number: int) -> Any:
+        index = self._open()["episode"]
+        return json.loads(index[name].asstr()[number]) if name in index else []
+
+    def _check_format(self, file: h5py.File) -> int:
         kind, version = file.attrs.get("format"), file.attrs.get("format_version")
         if kind != FORMAT:
             raise ValueError(f"{self.path} is an HDF5 file, but not an episode file")
-        if version != FORMAT_VERSION:
+        if version not in FORMAT_VERSIONS:
             raise ValueError(
-                f"{self.path} has format version {version}, and this program reads version {FORMAT_VERSION}; "
-                "collect the episodes again with: python -m envs.collect"
+                f"{self.path} has format version {version}, and this program reads versions "
+                f"{' and '.join(map(str, FORMAT_VERSIONS))}; collect the episodes again with: python -m envs.collect"
             )
+        return int(version)
+
+
+def swapped_questions(
+    instruction: str, objects: tuple[EpisodeObject, ...], moves: int, ends_at: int
+) -> tuple[Question, ...]:
+    """The sentences that a scene allows, from the one that was played: each object named as its kind is named there.
+
+    Empty where the sentence does not name the two objects by colour and kind. Files of format version 1 store no
+    questions.
+    """
+    first, second = (next(item for item in objects if item.id == id) for id in (moves, ends_at))
+    names = [f"{item.color} {item.kind}" for item in (first, second)]
+    if any(instruction.count(name) != 1 for name in names):
+        return ()
+    template = instruction.replace(names[0], "\0").replace(names[1], "\1")
+    return tuple(
+        Question(
+            template.replace("\0", f"{a.color} {a.kind}").replace("\1", f"{b.color} {b.kind}"), a.id, b.id
+        )
+        for a in objects
+        for b in objects
+        if a.kind == first.kind and b.kind == second.kind and a.id != b.id
+    )
+
+
+def words_of(sentences: Iterable[str]) -> set[str]:
+    """All words of some sentences, lower case."""
+    return set(re.findall(r"[a-z0-9']+", "\n".join(sentences).lower()))

@@ -4,7 +4,8 @@ Recolouring: the three colour channels of a scene's slots and of its sentence's 
 one random order. A parser whose content ignores hue (see `textocvp.parsers.placed`) would have found just these slots
 in the recoloured video, so a few caption colours become many, and the rule "the slot whose colour is the
 word's" is what they share. Where words carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red"
-would stay "red" while the red block turns blue."""
+would stay "red" while the red object turns blue.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.data.episodes import EpisodeFile
-from textocvp.data.slot_cache import SlotCache
+from textocvp.data.cache import FrameCache
+from textocvp.data.episodes import Episodes
 from textocvp.parsers.base import to_frames
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.text.base import TextEncoder, WordBatch
@@ -37,15 +38,6 @@ class SlotBatch:
     episodes_B: np.ndarray
     channels_B3: Tensor
 
-    def to(self, device: torch.device | str) -> SlotBatch:
-        return replace(self, slots_BTKD=self.slots_BTKD.to(device), words=self.words.to(device))
-
-    def select(self, rows: slice) -> SlotBatch:
-        """A sub-batch."""
-        return SlotBatch(
-            self.slots_BTKD[rows], self.words.select(rows), self.episodes_B[rows], self.channels_B3[rows]
-        )
-
 
 class SlotBatches:
     """Draws training batches from a slot cache held in memory.
@@ -55,32 +47,28 @@ class SlotBatches:
         layout: what their numbers mean.
         text: looks the sentences up; its weights are not used.
         frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
-        recolor: permute the colour channels. Has no effect, like `color_spread`, where slots have no explicit colour
-            or the words of `text` no RGB.
-        color_spread: stretch each colour channel of a scene and of its sentence by up to this, and shift it by up to
-            this, so that colours brighter and darker than the captioned ones are met.
+        recolor: permute the colour channels. Has no effect where slots have no explicit colour, or the words of `text`
+            no RGB.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
         place_jitter: standard deviation of the noise of `noisy`, in -1..1.
     """
 
     def __init__(
         self,
-        cache: SlotCache,
+        cache: FrameCache,
         layout: SlotLayout,
         text: TextEncoder,
         frames: int,
         *,
         recolor: bool,
-        color_spread: float,
         color_jitter: float,
         place_jitter: float,
     ) -> None:
         words_follow = layout.explicit and text.words_have_rgb
         self.layout, self.recolor = layout, recolor and words_follow
-        self.color_spread = color_spread if words_follow else 0.0
         self.color_jitter, self.place_jitter = color_jitter, place_jitter
         self.frames = frames
-        self._slots_ETKD = cache.padded(frames)
+        self._slots_ETKD = padded(cache, frames)
         self._words = text.lookup(cache.instructions).to("cpu")
 
     def __len__(self) -> int:
@@ -111,16 +99,13 @@ class SlotBatches:
         # Colour and presence are carried through a rollout: what they are in the first frame they are in all.
         order = channels_B3[:, None, None].expand_as(state.color[:, :1])
         color = state.color[:, :1].gather(-1, order)
-        stretch_B3, shift_B3 = (
-            torch.from_numpy(rng.uniform(-self.color_spread, self.color_spread, (size, 3)).astype(np.float32))
-            for _ in range(2)
-        )
-        color = color + stretch_B3[:, None, None] * color + shift_B3[:, None, None]
+        rng.random(
+            (2, size, 3)
+        )  # not used any more; without it a seed would give other runs than it always did
         color = (color + _noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
         presence = state.presence[:, :1].expand_as(state.presence)
         slots_BTKD = replace(state, color=color, presence=presence).join()
-        colors_BL3 = words.colors_BL3 + stretch_B3[:, None] * words.colors_BL3 + shift_B3[:, None]
-        colors_BL3 = colors_BL3 + _noise(rng, colors_BL3.shape, self.color_jitter)
+        colors_BL3 = words.colors_BL3 + _noise(rng, words.colors_BL3.shape, self.color_jitter)
         words = replace(words, colors_BL3=colors_BL3 * words.names_color_BL[..., None])
         return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
 
@@ -148,9 +133,16 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -
     return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)) * deviation
 
 
-def true_frames(episodes: EpisodeFile, batch: SlotBatch, times_BS: np.ndarray) -> Tensor:
-    """The frames (B, S, 3, H, W), -1..1, of these times, recoloured as the batch's slots were."""
-    clips = episodes.frames(batch.episodes_B)
+def padded(slots: FrameCache, frames: int) -> Tensor:
+    """All episodes at one length (E, T, K, D), as stored: the last frame repeated, or cut."""
+    return torch.from_numpy(slots.at(np.arange(len(slots)), np.arange(frames)))
+
+
+def true_frames(
+    episodes: Episodes, episodes_B: np.ndarray, times_BS: np.ndarray, channels_B3: Tensor
+) -> Tensor:
+    """Frames (B, S, 3, H, W), -1..1, of these times of these episodes, with their colour channels in these orders."""
+    clips = [episodes.frames(index) for index in episodes_B]
     chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]
     frames_BS3HW = to_frames(np.stack(chosen))
-    return frames_BS3HW.gather(2, batch.channels_B3[:, None, :, None, None].expand_as(frames_BS3HW))
+    return frames_BS3HW.gather(2, channels_B3[:, None, :, None, None].expand_as(frames_BS3HW))

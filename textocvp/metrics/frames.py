@@ -1,16 +1,10 @@
-"""How good masks and frames are, and how sure a figure is.
-
-Masks are compared with the simulator's segmentation: 0 is the background, 1 the arm, 2 + i object i. Nothing
-here is used to train anything.
-"""
+"""Predicted frames against true frames: PSNR and SSIM."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
-
-# ---------------------------------------------------------------- frames against true frames
 
 
 def psnr(imagined: Tensor, real: Tensor) -> Tensor:
@@ -21,15 +15,17 @@ def psnr(imagined: Tensor, real: Tensor) -> Tensor:
 
     Returns:
         (...).
+
+    Raises:
+        ValueError: if the shapes differ or are not of frames.
     """
-    _same_frames(imagined, real)
+    check_frames(imagined, real)
     error = (imagined.float() - real.float()).square().flatten(-3).mean(dim=-1)
     return -10 * torch.log10(error)
 
 
 def ssim(imagined: Tensor, real: Tensor) -> Tensor:
-    """Structural similarity of each frame, Gaussian window of 11 pixels and deviation 1.5, as the authors
-    measure it.
+    """Structural similarity of each frame with a Gaussian window of 11 pixels and deviation 1.5, as the authors do.
 
     The picture is mirrored at its edges, so that pixels there count too.
 
@@ -38,12 +34,12 @@ def ssim(imagined: Tensor, real: Tensor) -> Tensor:
 
     Returns:
         (...), at most 1.
+
+    Raises:
+        ValueError: if the shapes differ or are not of frames.
     """
-    _same_frames(imagined, real)
-    flat = [
-        frames.float().flatten(0, -4) if frames.ndim > 3 else frames.float()[None]
-        for frames in (imagined, real)
-    ]
+    check_frames(imagined, real)
+    flat = [frames.float().reshape(-1, *frames.shape[-3:]) for frames in (imagined, real)]
     value = structural_similarity_index_measure(
         flat[0], flat[1], gaussian_kernel=True, sigma=1.5, kernel_size=11, reduction="none", data_range=1.0
     )
@@ -51,8 +47,9 @@ def ssim(imagined: Tensor, real: Tensor) -> Tensor:
     return value.reshape(imagined.shape[:-3])
 
 
-def _same_frames(imagined: Tensor, real: Tensor) -> None:
-    if imagined.shape != real.shape or imagined.shape[-3] != 3:
+def check_frames(imagined: Tensor, real: Tensor) -> None:
+    """Raise a ValueError unless both are frames (..., 3, H, W) of one shape."""
+    if imagined.shape != real.shape or imagined.ndim < 3 or imagined.shape[-3] != 3:
         raise ValueError(
             f"need frames (..., 3, H, W) of one shape, got {tuple(imagined.shape)} and {tuple(real.shape)}"
         )

@@ -1,16 +1,16 @@
-"""JEDi: how far a set of imagined films is from a set of real ones (Luo et al., "Beyond FVD", ICLR 2025).
+"""JEDi: how far a set of imagined videos is from a set of real ones (Luo et al., "Beyond FVD", ICLR 2025).
 
 Maximum mean discrepancy with a polynomial kernel between V-JEPA features of the two sets. Lower is more alike, 0 for
 equal sets. The original takes the attentive probe of V-JEPA (ViT-L, Something-Something v2); here it is that of V-JEPA
-2, which transformers has, so figures compare with each other and not with those of the paper. Where its weights are not
-on the machine the figure is absent with a reason; it is never computed with random ones.
+2, which transformers has, so values compare with each other and not with those of the paper. Where its weights are not
+on the machine the metric is absent with a reason; it is never computed with random ones.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,19 +23,6 @@ from textocvp.metrics.perceptual import MetricUnavailable
 VJEPA = "facebook/vjepa2-vitl-fpc16-256-ssv2"
 #: Mean and deviation of ImageNet's colours for pictures in 0..1: what V-JEPA was trained on.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-class VideoFeatures(Protocol):
-    """Says in D numbers what happens in a film.
-
-    Attributes:
-        name: for tables.
-    """
-
-    name: str
-
-    def __call__(self, films_NT3HW: Tensor) -> Tensor:
-        """Features (N, D) of films (N, T, 3, H, W) in 0..1."""
 
 
 def polynomial_mmd(imagined_ND: np.ndarray, real_MD: np.ndarray) -> float:
@@ -60,21 +47,21 @@ def jedi(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """JEDi of N imagined films and the N real ones, with a bootstrap interval over scenes.
+    """JEDi of N imagined videos and the N real ones, with a bootstrap interval over scenes.
 
-    A scene is drawn with both its films. A scene that is drawn twice is paired with itself, which adds to the biased
-    figure of every resample; the interval is therefore moved so that the resamples' mean lies on the figure.
+    A scene is drawn with both its videos. A scene that is drawn twice is paired with itself, which adds to the biased
+    value of every resample; the interval is therefore moved so that the resamples' mean lies on the value.
 
     Args:
         imagined_ND, real_ND: features, row i of both from scene i.
         confidence, resamples, seed: of the interval.
 
     Raises:
-        ValueError: if the shapes differ or there is no film.
+        ValueError: if the shapes differ or there is no video.
     """
     if imagined_ND.shape != real_ND.shape:
         raise ValueError(
-            f"need a real film for each imagined one, got {imagined_ND.shape} and {real_ND.shape}"
+            f"need a real video for each imagined one, got {imagined_ND.shape} and {real_ND.shape}"
         )
     kernels, N = _kernels(imagined_ND, real_ND), len(real_ND)
     value = polynomial_mmd(imagined_ND, real_ND)
@@ -95,10 +82,12 @@ def _kernels(x_ND: np.ndarray, y_MD: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _discrepancy(kernels: tuple[np.ndarray, ...], a_SN: np.ndarray, b_SM: np.ndarray) -> np.ndarray:
     """(S,) for S pairs of weightings of the two sets."""
     own, other, between = kernels
-    parts = [np.einsum("sn,nm,sm->s", a, k, b, optimize=True)
-             for a, k, b in ((a_SN, own, a_SN), (b_SM, other, b_SM), (a_SN, between, b_SM))]  # fmt: skip
-    # Never below 0 but by rounding.
-    return 100 * np.maximum(parts[0] + parts[1] - 2 * parts[2], 0.0)
+
+    def mean(a: np.ndarray, kernel: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("sn,nm,sm->s", a, kernel, b, optimize=True)
+
+    found_S = mean(a_SN, own, a_SN) + mean(b_SM, other, b_SM) - 2 * mean(a_SN, between, b_SM)
+    return 100 * np.maximum(found_S, 0.0)  # never below 0 but by rounding
 
 
 @dataclass(frozen=True)
@@ -114,22 +103,22 @@ class VJepaFeatures:
     model: Any
 
     @torch.no_grad()
-    def __call__(self, films_NT3HW: Tensor) -> Tensor:
-        """See `VideoFeatures`. Films are stretched to the model's length and size."""
+    def __call__(self, videos_NT3HW: Tensor) -> Tensor:
+        """Features (N, D) of videos (N, T, 3, H, W) in 0..1, stretched to the model's length and size."""
         config = self.model.config
-        T = films_NT3HW.shape[1]
+        T = videos_NT3HW.shape[1]
         moments = torch.linspace(0, T - 1, config.frames_per_clip).round().long()
-        frames = films_NT3HW[:, moments].float().to(self.model.device)
+        frames = videos_NT3HW[:, moments].float().to(self.model.device)
         size = (config.crop_size, config.crop_size)
         flat = F.interpolate(frames.flatten(0, 1), size=size, mode="bicubic", antialias=True).clamp(0, 1)
         mean, deviation = (flat.new_tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
         pixels = ((flat - mean) / deviation).unflatten(0, frames.shape[:2])
         probe = getattr(self.model, "pooler", None)
         encoder = self.model if probe is None else self.model.vjepa2
-        # One at a time: a film is thousands of tokens.
+        # One at a time: a video is thousands of tokens.
         found = []
-        for film in pixels:
-            tokens_1ND = encoder(pixel_values_videos=film[None], skip_predictor=True).last_hidden_state
+        for video in pixels:
+            tokens_1ND = encoder(pixel_values_videos=video[None], skip_predictor=True).last_hidden_state
             found.append(tokens_1ND.mean(dim=1) if probe is None else probe(tokens_1ND))
         return torch.cat(found).cpu()
 
@@ -150,7 +139,7 @@ def load_vjepa(name_or_folder: str | Path = VJEPA) -> VJepaFeatures:
 
     name = str(name_or_folder)
     before = logging.get_verbosity()
-    logging.set_verbosity_error()  # it would print the list of missing weights, which is said below
+    logging.set_verbosity_error()  # it would print the missing weights, which the error below names
     try:
         config = AutoConfig.from_pretrained(name, local_files_only=True)
         probed = VJEPA2ForVideoClassification.__name__ in (config.architectures or [])

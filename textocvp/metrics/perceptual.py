@@ -1,7 +1,7 @@
 """Learned distances between pictures: LPIPS (Zhang et al. 2018) and ST-LPIPS (Ghildyal and Liu 2022).
 
 LPIPS needs the weights of AlexNet, which its library fetches on first use; ST-LPIPS has its weights in a package. Where
-weights cannot be had the figure is absent with a reason; it is never computed with random ones.
+weights are missing the metric is absent with a reason; it is never computed with random ones.
 """
 
 from __future__ import annotations
@@ -14,30 +14,28 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from textocvp.metrics.frames import check_frames
+
+CHANNELS = (64, 192, 384, 256, 256)
+MIN_SIZE = 21
+#: Mean and deviation of ImageNet's colours for pictures in -1..1, as in LPIPS.
+MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_CONVOLUTIONS = ("slice1.0", "slice2.5", "slice3.9", "slice4.11", "slice5.13")
 
 
 class MetricUnavailable(RuntimeError):
     """A metric cannot be computed on this machine; the message says why and what would help."""
 
 
-class PerceptualNetwork(Protocol):
-    """What a distance is made of: features of each picture, and their comparison."""
-
-    def features(self, frames_N3HW: Tensor, /) -> Sequence[Tensor]:
-        """Maps (N, C, h, w) of pictures in -1..1."""
-
-    def compare(self, imagined: Sequence[Tensor], real: Sequence[Tensor], /) -> Tensor:
-        """Distances (N,)."""
-
-
 @dataclass(frozen=True)
 class Features:
-    """Features of T pictures, kept so that several imagined films can be compared with one real film.
+    """Features of T pictures, kept so that several predictions can be compared with one true video.
 
     Attributes:
         layers: maps (T, C, h, w).
@@ -56,11 +54,13 @@ class PerceptualDistance:
 
     Attributes:
         name: the metric and its backbone, for tables.
-        network: does the work.
+        describe: pictures (N, 3, H, W) in -1..1 to feature maps (N, C, h, w).
+        difference: the maps of N pictures and of N others to distances (N,).
     """
 
     name: str
-    network: PerceptualNetwork
+    describe: Callable[[Tensor], Sequence[Tensor]]
+    difference: Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
 
     def __call__(self, imagined: Tensor, real: Tensor) -> Tensor:
         """Distance (...) of each of the frames (..., 3, H, W) in 0..1.
@@ -68,86 +68,19 @@ class PerceptualDistance:
         Raises:
             ValueError: if the shapes differ or are not of frames, or the frames are too small.
         """
-        if imagined.shape != real.shape or imagined.ndim < 3 or imagined.shape[-3] != 3:
-            raise ValueError(
-                f"need frames (..., 3, H, W) of one shape, "
-                f"got {tuple(imagined.shape)} and {tuple(real.shape)}"
-            )
-        shape = imagined.shape
-        flat = (self.features(frames.reshape(-1, *shape[-3:])) for frames in (imagined, real))
-        return self.compare(*flat).reshape(shape[:-3])
+        check_frames(imagined, real)
+        flat = (self.features(frames.reshape(-1, *frames.shape[-3:])) for frames in (imagined, real))
+        return self.compare(*flat).reshape(imagined.shape[:-3])
 
     @torch.no_grad()
     def features(self, frames_T3HW: Tensor) -> Features:
         """Features of frames (T, 3, H, W) in 0..1, computed on the CPU, where the networks are loaded."""
-        return Features(tuple(self.network.features(frames_T3HW.float().cpu() * 2 - 1)))
+        return Features(tuple(self.describe(frames_T3HW.float().cpu() * 2 - 1)))
 
     @torch.no_grad()
     def compare(self, imagined: Features, real: Features) -> Tensor:
         """Distances (T,) of equally many pictures."""
-        return self.network.compare(imagined.layers, real.layers)
-
-
-@dataclass(frozen=True)
-class _WholePictures:
-    """A network that takes two pictures at once: their features are the pictures themselves."""
-
-    network: Callable[[Tensor, Tensor], Tensor]
-
-    def features(self, frames_N3HW: Tensor) -> Sequence[Tensor]:
-        return (frames_N3HW,)
-
-    def compare(self, imagined: Sequence[Tensor], real: Sequence[Tensor]) -> Tensor:
-        return self.network(imagined[0], real[0]).flatten()
-
-
-def load_lpips() -> PerceptualDistance:
-    """LPIPS with AlexNet, the backbone of the paper's figures.
-
-    Raises:
-        MetricUnavailable: if the library or its weights cannot be loaded.
-    """
-    try:
-        import lpips
-    # A torchvision that was built for another torch fails with RuntimeError, not with ImportError.
-    except (ImportError, RuntimeError, OSError) as error:
-        raise MetricUnavailable(
-            f"LPIPS needs the package lpips and a torchvision that fits the installed torch: {error}"
-        ) from error
-    try:
-        # The library prints to stdout while it loads, and calls torchvision in a way that has gone out of fashion;
-        # both would end up in a study's table.
-        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            network: Any = lpips.LPIPS(net="alex", verbose=False).eval()
-    except (OSError, RuntimeError) as error:
-        raise MetricUnavailable(f"LPIPS could not load the weights of AlexNet: {error}") from error
-    return PerceptualDistance("LPIPS (AlexNet)", _WholePictures(network))
-
-
-def load_st_lpips() -> PerceptualDistance:
-    """ST-LPIPS with AlexNet. Its figures are not LPIPS figures: they rank alike, on another scale.
-
-    Raises:
-        MetricUnavailable: if its weights are not installed.
-    """
-    try:
-        return PerceptualDistance("ST-LPIPS (AlexNet)", load_shift_tolerant())
-    except WeightsNotFound as error:
-        raise MetricUnavailable(
-            f"ST-LPIPS cannot be computed: {error}. `pip install stlpips_pytorch` brings them"
-        ) from error
-
-
-CHANNELS = (64, 192, 384, 256, 256)
-MIN_SIZE = 21
-#: Mean and deviation of ImageNet's colours for pictures in -1..1, as in LPIPS.
-MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_CONVOLUTIONS = ("slice1.0", "slice2.5", "slice3.9", "slice4.11", "slice5.13")
-
-
-class WeightsNotFound(RuntimeError):
-    """The weights of ST-LPIPS are not installed, or are not what they should be."""
+        return self.difference(imagined.layers, real.layers)
 
 
 class ShiftTolerantAlexNet(nn.Module):
@@ -165,10 +98,13 @@ class ShiftTolerantAlexNet(nn.Module):
             for (before, after), size, padding in zip(pairwise((3, *CHANNELS)), sizes, paddings, strict=True)
         )
         self.weights = nn.ParameterList(nn.Parameter(torch.zeros(channels)) for channels in CHANNELS)
-        self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("deviation", torch.tensor(DEVIATION).view(3, 1, 1), persistent=False)
         line = torch.tensor([0.25, 0.5, 0.25])
-        self.register_buffer("blur", line[:, None] * line[None, :], persistent=False)
+        for name, values in (
+            ("mean", torch.tensor(MEAN).view(3, 1, 1)),
+            ("deviation", torch.tensor(DEVIATION).view(3, 1, 1)),
+            ("blur", line[:, None] * line[None, :]),
+        ):
+            self.register_buffer(name, values, persistent=False)
 
     def features(self, frames_N3HW: Tensor) -> tuple[Tensor, ...]:
         """Five maps (N, C, h, w) of pictures in -1..1, each pixel's features of length 1.
@@ -176,11 +112,9 @@ class ShiftTolerantAlexNet(nn.Module):
         Raises:
             ValueError: if the pictures are smaller than 21x21.
         """
-        if min(frames_N3HW.shape[-2:]) < MIN_SIZE:
-            raise ValueError(
-                f"ST-LPIPS needs pictures of at least {MIN_SIZE}x{MIN_SIZE} pixels, "
-                f"not {frames_N3HW.shape[-2]}x{frames_N3HW.shape[-1]}"
-            )
+        H, W = frames_N3HW.shape[-2:]
+        if min(H, W) < MIN_SIZE:
+            raise ValueError(f"ST-LPIPS needs pictures of at least {MIN_SIZE}x{MIN_SIZE} pixels, not {H}x{W}")
         x_NCHW = (frames_N3HW - self.mean) / self.deviation
         found = []
         for layer, convolution in enumerate(self.convolutions):
@@ -205,28 +139,43 @@ class ShiftTolerantAlexNet(nn.Module):
         return F.conv2d(F.pad(x_NCHW, (2, 2, 2, 2), mode="reflect"), kernel_C1hw, stride=2, groups=channels)
 
 
-def weights_file() -> Path:
-    """The authors' weights in the installed package `stlpips_pytorch`, which is not imported.
+def load_lpips() -> PerceptualDistance:
+    """LPIPS with AlexNet, the backbone of the paper's numbers.
 
     Raises:
-        WeightsNotFound: if the package is not installed or has no such file.
+        MetricUnavailable: if the library or its weights cannot be loaded.
     """
-    package = find_spec("stlpips_pytorch")
-    if package is None or package.origin is None:
-        raise WeightsNotFound("the package stlpips_pytorch, which has the weights, is not installed")
-    path = Path(package.origin).parent / "weights" / "vST0.0" / "alex_shift_tolerant.pth"
-    if not path.is_file():
-        raise WeightsNotFound(f"stlpips_pytorch has no weights {path}: another version of it?")
-    return path
+    try:
+        import lpips
+    # A torchvision that was built for another torch fails with RuntimeError, not with ImportError.
+    except (ImportError, RuntimeError, OSError) as error:
+        raise MetricUnavailable(
+            f"LPIPS needs the package lpips and a torchvision that fits the installed torch: {error}"
+        ) from error
+    try:
+        # The library prints to stdout while it loads, and calls torchvision in a way that has gone out of fashion;
+        # both would end up in a study's table.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            network: Any = lpips.LPIPS(net="alex", verbose=False).eval()
+    except (OSError, RuntimeError) as error:
+        raise MetricUnavailable(f"LPIPS could not load the weights of AlexNet: {error}") from error
+    # The library takes two pictures at once, so their features are the pictures themselves.
+    return PerceptualDistance(
+        "LPIPS (AlexNet)", lambda frames: (frames,), lambda a, b: network(a[0], b[0]).flatten()
+    )
 
 
-def load_shift_tolerant(path: Path | None = None) -> ShiftTolerantAlexNet:
-    """The network with the authors' weights; `path` is a file other than the installed one.
+def load_st_lpips(weights: Path | None = None) -> PerceptualDistance:
+    """ST-LPIPS with AlexNet. Its values are not LPIPS values: they rank alike, on another scale.
+
+    Args:
+        weights: file of the authors' weights; the one in the package stlpips_pytorch by default.
 
     Raises:
-        WeightsNotFound: if they are not there, or are those of another network.
+        MetricUnavailable: if the weights are not there, or are those of another network.
     """
-    path = path or weights_file()
+    path = weights or st_lpips_weights()
     stored = torch.load(path, map_location="cpu", weights_only=True)
     network = ShiftTolerantAlexNet()
     try:
@@ -237,5 +186,27 @@ def load_shift_tolerant(path: Path | None = None) -> ShiftTolerantAlexNet:
             state[f"weights.{layer}"] = stored[f"lin{layer}.model.1.weight"].flatten()
         network.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
-        raise WeightsNotFound(f"{path} has not the weights of ST-LPIPS (AlexNet): {error}") from error
-    return network.eval().requires_grad_(False)
+        raise _no_st_lpips(f"{path} has not the weights of ST-LPIPS (AlexNet): {error}") from error
+    network.eval().requires_grad_(False)
+    return PerceptualDistance("ST-LPIPS (AlexNet)", network.features, network.compare)
+
+
+def st_lpips_weights() -> Path:
+    """The authors' weights in the installed package `stlpips_pytorch`, which is not imported.
+
+    Raises:
+        MetricUnavailable: if the package is not installed or has no such file.
+    """
+    package = find_spec("stlpips_pytorch")
+    if package is None or package.origin is None:
+        raise _no_st_lpips("the package stlpips_pytorch, which has the weights, is not installed")
+    path = Path(package.origin).parent / "weights" / "vST0.0" / "alex_shift_tolerant.pth"
+    if not path.is_file():
+        raise _no_st_lpips(f"stlpips_pytorch has no weights {path}: another version of it?")
+    return path
+
+
+def _no_st_lpips(reason: str) -> MetricUnavailable:
+    return MetricUnavailable(
+        f"ST-LPIPS cannot be computed: {reason}. `pip install stlpips_pytorch` brings them"
+    )

@@ -1,82 +1,76 @@
-"""How well a parser finds the things of held-out episodes, measured against the simulator's segmentation.
+"""How well a parser finds the objects of held-out episodes, measured against their true masks, if they have any.
 
-The segmentation is used for measuring only; nothing here is ever trained on.
+Masks are used for measuring only; nothing here is ever trained on.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 
-from textocvp.data.episodes import EpisodeFile
-from textocvp.metrics.frames import psnr
-from textocvp.metrics.intervals import Interval, bootstrap_interval
-from textocvp.metrics.masks import followed, foreground_ari, object_ious
+from textocvp.data.episodes import Episodes
+from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
+from textocvp.training.run import Metrics
 
-GATES = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
+THRESHOLDS = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
 """What a parser of the tabletop must reach on held-out episodes before a predictor is worth training on its slots."""
+
+ONE_SLOT = "one slot: there are no masks to measure"
+NO_MASKS = "the held-out episodes have no masks: only the redrawn frames are measured"
 
 
 @dataclass(frozen=True)
-class ParserMetrics:
+class ParserMetrics(Metrics):
     """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval.
 
-    A model with one slot has one mask, in which no object can be found or followed: all but its PSNR is None.
+    Without masks to compare, all but the PSNR is None: a model with one slot draws none, and episodes may have none.
 
     Attributes:
-        object_miou: IoU of drawn masks with blocks and bowls, Hungarian matching a frame.
-        object_found: share of blocks and bowls with an IoU above one half.
-        followed: share of the first frame's things whose slot keeps them through the whole episode.
-        foreground_ari: adjusted Rand index without the background's pixels, the arm included.
+        object_miou: IoU of drawn masks with objects, Hungarian matching a frame.
+        object_found: share of objects with an IoU above one half.
+        followed: share of the first frame's objects whose slot keeps them through the whole episode.
+        foreground_ari: adjusted Rand index without the background's pixels, the robot included.
         psnr: of the redrawn frames, dB.
+        left_out: why the others are None; empty where they are not.
     """
+
+    group: ClassVar[str] = "quality"
 
     object_miou: Interval | None
     object_found: Interval | None
     followed: Interval | None
     foreground_ari: Interval | None
     psnr: Interval
+    left_out: str = ""
 
     def __str__(self) -> str:
-        text = ", ".join(f"{name} {interval}" for name, interval in self._measured().items())
-        return text if self.object_miou is not None else f"{text} (one slot: there are no masks to measure)"
+        text = ", ".join(f"{name} {interval}" for name, interval in self.measured().items())
+        return f"{text} ({self.left_out})" if self.left_out else text
 
-    def _measured(self) -> dict[str, Interval]:
-        named = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
-        return {name: interval for name, interval in named if interval is not None}
+    def below_threshold(self) -> list[str]:
+        """A sentence for each figure below its threshold; empty for a parser that is good enough.
 
-    def figures(self) -> dict[str, float]:
-        """The values alone, named for a log."""
-        return {f"quality/{name}": interval.value for name, interval in self._measured().items()}
-
-    def missed_gates(self) -> list[str]:
-        """A sentence for each figure below its gate; empty for a parser that is good enough.
-
-        The gates are for slots that are things, so a model with one slot misses none.
+        The thresholds are for slots that hold objects, so what was not measured is not below one.
         """
-        measured = self._measured()
+        measured = self.measured()
         return [
-            f"{name} is {measured[name].value:.3f}, below its gate of {gate:.2f}"
-            for name, gate in GATES.items()
-            if name in measured and measured[name].value < gate
+            f"{name} is {measured[name].value:.3f}, below its threshold of {threshold:.2f}"
+            for name, threshold in THRESHOLDS.items()
+            if name in measured and measured[name].value < threshold
         ]
-
-    def to_json(self) -> str:
-        """Values, intervals and numbers of episodes."""
-        return json.dumps(asdict(self), indent=2) + "\n"
 
 
 @torch.no_grad()
 def measure_parser(
-    model: TextOCVP, episodes: EpisodeFile, chosen: Iterable[int], *, frame_step: int = 3
+    model: TextOCVP, episodes: Episodes, chosen: Iterable[int], *, frame_step: int = 3
 ) -> ParserMetrics:
-    """Parse whole episodes and compare the drawn masks with the simulator's.
+    """Parse whole episodes and compare the drawn masks with the true ones.
 
     Args:
         model: its parser and renderer are measured.
@@ -85,9 +79,9 @@ def measure_parser(
         frame_step: IoU, ARI and PSNR are taken at every `frame_step`-th frame; following always at every frame.
     """
     ious, found, follows, aris, psnrs = [], [], [], [], []
+    left_out = NO_MASKS
     for index in chosen:
-        episode = episodes.episode(index)
-        frames = to_frames(episode.frames[None], model.device)[0]
+        frames = to_frames(episodes.frames(index)[None], model.device)[0]
         # Where first slots are drawn, an episode's are the same whenever it is measured.
         seeded = torch.Generator(model.device).manual_seed(index)
         slots = model.parser(frames[None], generator=seeded).slots_BTKD[0]
@@ -95,17 +89,25 @@ def measure_parser(
         drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
         psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())
         if slots.shape[1] == 1:
+            left_out = ONE_SLOT
+            continue
+        truth = episodes.truth(index)
+        if truth is None or truth.segmentation is None:
             continue
         labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
-        # The arm (1) is not an object: as background it matches nothing.
-        objects = np.where(episode.segmentation == 1, 0, episode.segmentation)
+        # All that is neither background nor robot is an object.
+        segmentation = truth.segmentation
+        objects = [label for label in np.unique(segmentation).tolist() if label not in (0, truth.robot)]
         times = range(0, len(labels), frame_step)
-        matches = np.concatenate([object_ious(labels[t], objects[t]).ious for t in times])
+        matches = np.concatenate([object_ious(labels[t], segmentation[t], objects).ious for t in times])
+        if len(matches) == 0:  # nothing but background
+            continue
         ious.append(matches.mean())
         found.append((matches > 0.5).mean())
-        follows.append(followed(labels, objects).mean())
-        aris.append(np.mean([foreground_ari(labels[t], episode.segmentation[t]) for t in times]))
+        follows.append(followed(labels, segmentation, objects).mean())
+        aris.append(np.mean([foreground_ari(labels[t], segmentation[t]) for t in times]))
     miou, share, kept, ari = (
-        bootstrap_interval(values) if values else None for values in (ious, found, follows, aris)
+        bootstrap_interval(values) if not np.isnan(values).all() else None
+        for values in (ious, found, follows, aris)
     )
-    return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs))
+    return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs), "" if ious else left_out)

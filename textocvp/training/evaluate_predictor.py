@@ -1,50 +1,57 @@
-"""Does the imagined block end in the named bowl? Measured during training, on held-out episodes.
+"""Does the imagined object end where the sentence says? Measured on held-out episodes, whose questions are asked.
 
-The simulator's first segmentation says which slot is which thing. That is for measuring only: nothing is
-trained on it, and the planner grounds slots by their looks (`planning`)."""
+The first frame's true masks say which slot holds which object. That is for measuring only: nothing is trained on it,
+and the planner grounds slots by their looks (`planning`). Episodes without masks or questions, and slots without
+explicit places, are measured by how far imagined slots are from parsed ones.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from textocvp.data.cache import FrameCache
+from textocvp.data.episodes import Episodes, Question
+from textocvp.data.slot_batches import padded
 from textocvp.layers import pixel_grid
+from textocvp.metrics.intervals import Interval, bootstrap_interval
 from textocvp.model import TextOCVP, evaluating
 from textocvp.slots import SlotLayout, SlotState
-
-if TYPE_CHECKING:
-    from textocvp.data.episodes import Episode, EpisodeFile
-    from textocvp.data.slot_cache import SlotCache
-
+from textocvp.training.losses import MOVES
+from textocvp.training.run import Metrics
 
 PIXEL = 2 / 64  # the thresholds are for 64x64 frames; in -1..1
-REACHED = 6 * PIXEL  # a block that ends closer than this to where the bowl's slot started is in the bowl
-MATCHED = 4 * PIXEL  # a slot farther than this from a thing's centroid does not hold it
+REACHED = 6 * PIXEL  # an object that ends closer than this to where the other's slot started is at it
+MATCHED = 4 * PIXEL  # a slot farther than this from an object's centroid does not hold it
+BATCH = 64  # rollouts at a time
+
+NO_QUESTIONS = "the held-out episodes have no masks and questions: no instruction following"
+NO_PLACES = "slots have no explicit places: no instruction following"
 
 
 @dataclass(frozen=True)
-class InstructionFollowing:
+class InstructionFollowing(Metrics):
     """Shares of held-out episodes.
 
     Attributes:
-        original: the block named by the episode's instruction ends in the bowl that it names.
-        other_bowl: the same with another bowl of the scene named.
-        wrong_text: told to move another block, or into another bowl, the first block still ends in the first
-            bowl.
-        error_px: median distance between where the named block ends in the rollout and in the episode, pixels
-            of 64.
-        grounded: both named things have a slot in the first frame (the ceiling of the first two).
+        original: the object that the episode's instruction moves ends where the instruction says.
+        other_target: the same with a sentence that moves the same object to another one.
+        wrong_text: given any other sentence, the first object still ends where the instruction says.
+        error_px: median distance between where that object ends in the rollout and in the episode, pixels of 64.
+        grounded: both objects of the instruction have a slot in the first frame (the ceiling of the first two).
         episodes: how many were tried.
     """
 
+    group: ClassVar[str] = "following"
+
     original: float
-    other_bowl: float
+    other_target: float
     wrong_text: float
     error_px: float
     grounded: float
@@ -52,177 +59,216 @@ class InstructionFollowing:
 
     def __str__(self) -> str:
         return (
-            f"original {self.original:.3f}, other bowl {self.other_bowl:.3f}, "
+            f"original {self.original:.3f}, other target {self.other_target:.3f}, "
             f"wrong text {self.wrong_text:.3f}, median error {self.error_px:.2f} px, "
             f"grounded {self.grounded:.3f} ({self.episodes} episodes)"
         )
 
-    def figures(self) -> dict[str, float]:
-        """The figures, named for a log."""
-        return {
-            f"following/{name}": getattr(self, name)
-            for name in self.__dataclass_fields__
-            if name != "episodes"
-        }
+
+@dataclass(frozen=True)
+class SlotErrors(Metrics):
+    """How far imagined slots are from parsed ones, a mean over episodes with its 95 % bootstrap interval.
+
+    Attributes:
+        error: distance of the places of slots that move, in pixels of 64; without explicit places the root mean square
+            error of all numbers of all slots. None where nothing moves.
+        still_error: what it would be if nothing moved.
+        left_out: why instruction following was not measured.
+    """
+
+    error: Interval | None
+    still_error: Interval | None
+    left_out: str
+
+    def __str__(self) -> str:
+        return f"slot error {self.error}, if nothing moved {self.still_error} ({self.left_out})"
 
 
 @dataclass(frozen=True)
-class Thing:
-    """A block or a bowl in the first frame of an episode, by the simulator.
+class Trial:
+    """A sentence for an episode, and the outcome that is looked for.
 
     Attributes:
-        kind, color: as captions name it.
-        place: centroid (x, y) of what is seen of it, -1..1; NaN if it is hidden.
-        size: standard deviation (x, y) of it, same unit. A block lies in the middle of its bowl, and only its size
-            tells the two apart.
-        named: whether the episode's instruction names it.
+        episode: its number.
+        text: the sentence.
+        moves: the slot that should move; -1 if no slot holds the object.
+        ends_at: the slot where it should end; -1 likewise.
     """
 
-    kind: str
-    color: str
-    place: tuple[float, float]
-    size: tuple[float, float]
-    named: bool
+    episode: int
+    text: str
+    moves: int
+    ends_at: int
 
 
 @dataclass(frozen=True)
-class Question:
-    """One scene: which slots its named things are in (-1: in none), and three sentences about it.
+class Trials:
+    """What is asked of the held-out episodes: at most one trial of each kind an episode; see `InstructionFollowing`."""
 
-    Attributes:
-        block, bowl, other_bowl: slots. Without another bowl in the scene `other_bowl` is None, and so is
-            `other`.
-        original, other, wrong: sentences: the episode's own; the block into the other bowl; something else,
-            if there is.
-    """
+    original: list[Trial] = field(default_factory=list)
+    other_target: list[Trial] = field(default_factory=list)
+    wrong_text: list[Trial] = field(default_factory=list)
 
-    block: int
-    bowl: int
-    other_bowl: int | None
-    original: str
-    other: str | None
-    wrong: str | None
-
-
-def things_of(episode: Episode) -> list[Thing]:
-    """The blocks and bowls in the first frame of an episode."""
-    labels_HW = episode.segmentation[0]
-    grid_HW2 = pixel_grid(*labels_HW.shape).numpy()
-    things = []
-    for item in episode.objects:
-        mask_HW = labels_HW == 2 + item.id
-        seen_N2 = grid_HW2[mask_HW] if mask_HW.any() else np.full((1, 2), math.nan)
-        (x, y), (wide, high) = seen_N2.mean(axis=0).tolist(), seen_N2.std(axis=0).tolist()
-        things.append(Thing(item.kind, item.color, (x, y), (wide, high), item.id in episode.target))
-    return things
-
-
-def following_questions(
-    cache: SlotCache, episodes: EpisodeFile, layout: SlotLayout, seed: int = 0
-) -> list[Question]:
-    """A question about each of the cache's episodes."""
-    rng = np.random.default_rng(seed)
-    return [ask(things_of(episodes.episode(i)), cache.episode(i)[0], layout, rng) for i in range(len(cache))]
-
-
-def ask(things: Sequence[Thing], slots_KD: Tensor, layout: SlotLayout, rng: np.random.Generator) -> Question:
-    """The question that a scene allows.
-
-    Args:
-        things: what the simulator says is there.
-        slots_KD: the slots of the first frame.
-        layout: what their numbers mean.
-        rng: picks the other bowl and the wrong sentence.
-    """
-    state = SlotState.split(slots_KD, layout)
-    is_thing_K = state.is_thing[:, 0]
-
-    def slot(thing: Thing) -> int:
-        off_K = (state.position - torch.tensor(thing.place)).norm(dim=-1)
-        other_size_K = (state.scale - torch.tensor(thing.size)).norm(dim=-1)
-        cost_K = (off_K + other_size_K).masked_fill(~is_thing_K | ~(off_K < MATCHED), math.inf)
-        return int(cost_K.argmin()) if cost_K.isfinite().any() else -1
-
-    def sentence(block: Thing, bowl: Thing) -> str:
-        return f"put the {block.color} block in the {bowl.color} bowl"
-
-    blocks = [thing for thing in things if thing.kind == "block"]
-    bowls = [thing for thing in things if thing.kind == "bowl"]
-    block, bowl = (next(thing for thing in group if thing.named) for group in (blocks, bowls))
-    others = [thing for thing in bowls if thing is not bowl]
-    other = others[rng.integers(len(others))] if others else None
-    wrong = [sentence(a, b) for a in blocks for b in bowls if a is not block or b is not bowl]
-    return Question(
-        block=slot(block),
-        bowl=slot(bowl),
-        other_bowl=None if other is None else slot(other),
-        original=sentence(block, bowl),
-        other=None if other is None else sentence(block, other),
-        wrong=wrong[rng.integers(len(wrong))] if wrong else None,
-    )
-
-
-class FollowingTest:
-    """Held-out scenes and the questions about them.
-
-    Args:
-        slots_ETKD: true slots of whole episodes, padded with their last frame.
-        questions: one an episode.
-        layout: what the numbers of a slot mean.
-        batch: rollouts at a time.
-    """
-
-    def __init__(
-        self, slots_ETKD: Tensor, questions: Sequence[Question], layout: SlotLayout, batch: int = 64
+    def add(
+        self,
+        episode: int,
+        played: Question,
+        questions: Sequence[Question],
+        slot_of: Mapping[int, int],
+        rng: np.random.Generator,
     ) -> None:
-        self.slots_ETKD, self.questions, self.layout, self.batch = slots_ETKD, list(questions), layout, batch
+        """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence.
 
-    def measure(self, model: TextOCVP, episodes: int | None = None) -> InstructionFollowing:
-        """Imagine the first `episodes` (default: all) and see where the named blocks end."""
-        asked = self.questions[:episodes]
-        everyone = range(len(asked))
-        other = [i for i in everyone if asked[i].other is not None]
-        wrong = [i for i in everyone if asked[i].wrong is not None]
-        ends = self._ends(model, everyone, [question.original for question in asked])
-        ends_other = self._ends(model, other, [asked[i].other or "" for i in other])
-        ends_wrong = self._ends(model, wrong, [asked[i].wrong or "" for i in wrong])
-        errors = [
-            float((ends[i][asked[i].block] - self._place(i, -1, asked[i].block)).norm())
-            for i in everyone
-            if asked[i].block >= 0
-        ]
-        return InstructionFollowing(
-            original=_share(self._reached(i, ends[i], asked[i].bowl) for i in everyone),
-            other_bowl=_share(self._reached(i, ends_other[i], asked[i].other_bowl) for i in other),
-            wrong_text=_share(self._reached(i, ends_wrong[i], asked[i].bowl) for i in wrong),
-            error_px=float(np.median(errors)) / PIXEL if errors else math.nan,
-            grounded=_share(question.block >= 0 and question.bowl >= 0 for question in asked),
-            episodes=len(asked),
+        Args:
+            slot_of: the slot that holds each object, by the object's id; -1 for none.
+        """
+        moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
+        self.original.append(Trial(episode, played.text, moves, ends_at))
+        elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
+        if elsewhere:
+            other = elsewhere[rng.integers(len(elsewhere))]
+            self.other_target.append(Trial(episode, other.text, moves, slot_of[other.ends_at]))
+        wrong = [q for q in questions if q != played]
+        if wrong:
+            text = wrong[rng.integers(len(wrong))].text
+            self.wrong_text.append(Trial(episode, text, moves, ends_at))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out episodes as slots, and what is asked of them.
+
+    Attributes:
+        slots_ETKD: true slots of whole episodes, padded with their last frame.
+        instructions: their sentences.
+        layout: what the numbers of a slot mean.
+        trials: empty where instruction following cannot be measured; then slot errors are.
+    """
+
+    slots_ETKD: Tensor
+    instructions: tuple[str, ...]
+    layout: SlotLayout
+    trials: Trials
+
+    @classmethod
+    def of(
+        cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, seed: int = 0
+    ) -> HeldOut:
+        """Held-out episodes at a length of so many frames; `seed` picks what is asked."""
+        rng, trials = np.random.default_rng(seed), Trials()
+        for index in range(len(episodes)) if layout.explicit else ():
+            truth = episodes.truth(index)
+            played = truth and truth.question(episodes.instructions[index])
+            if truth is None or truth.segmentation is None or not played:
+                continue
+            state = SlotState.split(torch.from_numpy(slots.episode(index)[0].astype(np.float32)), layout)
+            slot_of = {
+                item.id: slot_at(state, *place_and_size(truth.segmentation[0] == item.label))
+                for item in truth.objects
+            }
+            trials.add(index, played, truth.questions, slot_of, rng)
+        return cls(padded(slots, frames).float(), episodes.instructions, layout, trials)
+
+    @property
+    def file(self) -> str:
+        """What the file of the figures is called."""
+        return "following.json" if self.trials.original else "slot_errors.json"
+
+    def measure(self, model: TextOCVP, count: int | None = None) -> InstructionFollowing | SlotErrors:
+        """Figures of the first `count` episodes (default: all)."""
+        return (evaluate_following if self.trials.original else evaluate_slots)(model, self, count)
+
+
+def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Centroid and standard deviation (x, y) of a mask, -1..1; NaN if it is empty."""
+    grid_HW2 = pixel_grid(*mask_HW.shape).numpy()
+    seen_N2 = grid_HW2[mask_HW] if mask_HW.any() else np.full((1, 2), math.nan, np.float32)
+    return torch.from_numpy(seen_N2.mean(axis=0)), torch.from_numpy(seen_N2.std(axis=0))
+
+
+def slot_at(state: SlotState, place_2: Tensor, size_2: Tensor) -> int:
+    """The slot of a frame that is of this place and size; -1 if there is none close enough.
+
+    An object may lie in the middle of another, and only its size tells the two apart.
+    """
+    off_K = (state.position - place_2).norm(dim=-1)
+    other_size_K = (state.scale - size_2).norm(dim=-1)
+    cost_K = (off_K + other_size_K).masked_fill(~state.is_thing[:, 0] | ~(off_K < MATCHED), math.inf)
+    return int(cost_K.argmin()) if cost_K.isfinite().any() else -1
+
+
+def evaluate_following(model: TextOCVP, held: HeldOut, count: int | None = None) -> InstructionFollowing:
+    """Imagine the trials of the first `count` episodes (default: all) and see where the objects end."""
+    places_ETK2 = SlotState.split(held.slots_ETKD, held.layout).position
+
+    def reached(asked: list[Trial], ends_NK2: list[Tensor]) -> float:
+        return _share(
+            trial.moves >= 0
+            and trial.ends_at >= 0
+            and float((ends_K2[trial.moves] - places_ETK2[trial.episode, 0, trial.ends_at]).norm()) < REACHED
+            for trial, ends_K2 in zip(asked, ends_NK2, strict=True)
         )
 
-    @torch.no_grad()
-    def _ends(self, model: TextOCVP, episodes: Sequence[int], sentences: Sequence[str]) -> dict[int, Tensor]:
-        """Where the slots of the episodes end, (K, 2) each, when told the sentences."""
-        ends: dict[int, Tensor] = {}
-        steps = self.slots_ETKD.shape[1] - 1
-        for at in range(0, len(episodes), self.batch):
-            chosen = list(episodes[at : at + self.batch])
-            seed = self.slots_ETKD[chosen, :1].to(model.device)
-            with evaluating(model):
-                text = model.text(sentences[at : at + self.batch])
-                imagined = model.predictor.rollout(seed, text, steps)
-            last = SlotState.split(imagined.slots_BSKD[:, -1].float().cpu(), self.layout)
-            ends.update(zip(chosen, last.position, strict=True))
-        return ends
+    chosen = [
+        [trial for trial in kind if count is None or trial.episode < count]
+        for kind in (held.trials.original, held.trials.other_target, held.trials.wrong_text)
+    ]
+    ends = [_ends(model, held, asked) for asked in chosen]
+    errors = [
+        float((ends_K2[trial.moves] - places_ETK2[trial.episode, -1, trial.moves]).norm())
+        for trial, ends_K2 in zip(chosen[0], ends[0], strict=True)
+        if trial.moves >= 0
+    ]
+    original, other_target, wrong_text = map(reached, chosen, ends)
+    grounded = _share(trial.moves >= 0 and trial.ends_at >= 0 for trial in chosen[0])
+    error_px = float(np.median(errors)) / PIXEL if errors else math.nan
+    return InstructionFollowing(original, other_target, wrong_text, error_px, grounded, len(chosen[0]))
 
-    def _place(self, episode: int, frame: int, slot: int) -> Tensor:
-        return SlotState.split(self.slots_ETKD[episode, frame, slot], self.layout).position
 
-    def _reached(self, episode: int, ends_K2: Tensor, bowl: int | None) -> bool:
-        block = self.questions[episode].block
-        if block < 0 or bowl is None or bowl < 0:
-            return False
-        return float((ends_K2[block] - self._place(episode, 0, bowl)).norm()) < REACHED
+def evaluate_slots(model: TextOCVP, held: HeldOut, count: int | None = None) -> SlotErrors:
+    """Imagine the first `count` episodes (default: all) with their own sentences, and compare with the true slots."""
+    errors: list[float] = []
+    still_errors: list[float] = []
+    slots_ETKD, sentences = held.slots_ETKD[:count], held.instructions[:count]
+    for at in range(0, len(sentences), BATCH):
+        true_BTKD = slots_ETKD[at : at + BATCH]
+        imagined_BSKD = _imagined(model, true_BTKD, sentences[at : at + BATCH])
+        for true_TKD, imagined_SKD in zip(true_BTKD, imagined_BSKD, strict=True):
+            errors.append(_slot_error(imagined_SKD, true_TKD, held.layout))
+            still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, held.layout))
+    left_out = NO_QUESTIONS if held.layout.explicit else NO_PLACES
+    if np.isnan(errors).all():
+        return SlotErrors(None, None, left_out)
+    return SlotErrors(bootstrap_interval(errors), bootstrap_interval(still_errors), left_out)
+
+
+def _slot_error(imagined_SKD: Tensor, true_TKD: Tensor, layout: SlotLayout) -> float:
+    """See `SlotErrors.error`; NaN where nothing moves."""
+    if not layout.explicit:
+        return float((imagined_SKD - true_TKD[1:]).square().mean().sqrt())
+    true, imagined = SlotState.split(true_TKD, layout), SlotState.split(imagined_SKD, layout)
+    moves_K = ((true.position - true.position[:1]).norm(dim=-1) > MOVES).any(dim=0) & true.is_thing[0, :, 0]
+    return float((imagined.position - true.position[1:]).norm(dim=-1)[:, moves_K].mean()) / PIXEL
+
+
+@torch.no_grad()
+def _imagined(model: TextOCVP, slots_BTKD: Tensor, sentences: Sequence[str]) -> Tensor:
+    """The slots (B, T - 1, K, D) that follow the first frames."""
+    with evaluating(model):
+        text = model.text(sentences)
+        rollout = model.predictor.rollout(slots_BTKD[:, :1].to(model.device), text, slots_BTKD.shape[1] - 1)
+    return rollout.slots_BSKD.float().cpu()
+
+
+def _ends(model: TextOCVP, held: HeldOut, asked: list[Trial]) -> list[Tensor]:
+    """Where the slots end when each sentence is carried out, (K, 2) for each trial."""
+    ends: list[Tensor] = []
+    for at in range(0, len(asked), BATCH):
+        chosen = asked[at : at + BATCH]
+        true_BTKD = held.slots_ETKD[[trial.episode for trial in chosen]]
+        last_BKD = _imagined(model, true_BTKD, [trial.text for trial in chosen])[:, -1]
+        ends.extend(SlotState.split(last_BKD, held.layout).position)
+    return ends
 
 
 def _share(outcomes: Iterable[bool]) -> float:

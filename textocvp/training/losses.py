@@ -1,4 +1,4 @@
-"""What the parser is trained for (stage 1). The predictor's losses live beside its loop."""
+"""What the parser (stage 1) and the predictor (stage 2) are trained for."""
 
 from __future__ import annotations
 
@@ -11,9 +11,20 @@ from torch import Tensor
 from textocvp.renderers.base import Rendered
 from textocvp.slots import SlotLayout, SlotState, moments
 
+MOVES = 0.015  # a slot moves when its centre shifts by more than this in a frame, -1..1: half a pixel of 64
+UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
+
+
+class LossTerms:
+    """The terms of a loss: a dataclass of scalars."""
+
+    def as_metrics(self) -> dict[str, Tensor]:
+        """The terms, named for a log."""
+        return {f"loss/{name}": value.detach() for name, value in vars(self).items()}
+
 
 @dataclass
-class ParserLoss:
+class ParserLoss(LossTerms):
     """The terms of stage 1, each a scalar.
 
     Attributes:
@@ -34,10 +45,6 @@ class ParserLoss:
         return (
             self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
         )
-
-    def figures(self) -> dict[str, Tensor]:
-        """The terms, named for a log."""
-        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
 
 
 def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
@@ -98,14 +105,8 @@ def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Ten
     return ((position_BK2 - center_BK2).square() + (scale_BK2 / deviation_BK2).log().square()).mean()
 
 
-MOVES = (
-    0.015  # a slot moves when its centre shifts by more than this in a frame, in -1..1: half a pixel of 64
-)
-UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
-
-
 @dataclass
-class SlotLoss:
+class SlotLoss(LossTerms):
     """The terms, each a scalar averaged over slots with the weights of the moving ones.
 
     Attributes:
@@ -122,10 +123,6 @@ class SlotLoss:
     def total(self, scale_weight: float, content_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
         return self.position + scale_weight * self.scale + content_weight * self.content
-
-    def figures(self) -> dict[str, Tensor]:
-        """The terms, named for a log."""
-        return {f"loss/{name}": getattr(self, name).detach() for name in self.__dataclass_fields__}
 
 
 def slot_loss(

@@ -1,11 +1,11 @@
-"""What all stages of training share: their settings, and a run that takes updates on one process or on many.
+"""What all stages of training share: settings, data, held-out figures, and a run of updates on one process or many.
 
 A run's folder holds `state/` (everything needed to continue exactly: weights, optimiser, schedule, random numbers and
 the number of the next step), `logs/` (TensorBoard) and whatever the stage writes for people and for the next stage.
 
 Whatever is random in an update is a function of (seed, step) alone, and every process knows the whole batch's: each
-computes its rows of it, in as many parts as its memory needs, and the losses of all parts add up to that of the batch.
-So a run is the same run on one process or on many, in one part or in many, stopped and continued or not.
+computes its rows of it, in as many micro-batches as its memory needs, whose losses add up to that of the batch. So a
+run is the same run on one process or on many, in one micro-batch or in many, stopped and continued or not.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -37,11 +37,12 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data import open_episodes
+from textocvp.data.episodes import Episodes
 
 STEP_FILE = "step.json"
 LOG_EVERY = 20  # updates
-PATIENCE = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
+SYNC_TIMEOUT = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
 
 
 class SettingsError(ValueError):
@@ -61,24 +62,6 @@ def allowed_settings() -> Iterator[None]:
         if type(error) is not ValueError:
             raise
         raise SettingsError(str(error)) from error
-
-
-def check_frame_size(image_size: int, setting: str, *sources: EpisodeFile) -> None:
-    """Check that a model reads frames of the size that episodes have.
-
-    Args:
-        image_size: side of the frames that it reads, in pixels.
-        setting: what that is called in its configuration.
-
-    Raises:
-        SettingsError: if a file has frames of another size.
-    """
-    for source in sources:
-        if source.image_size != image_size:
-            raise SettingsError(
-                f"{source.path} has frames of {source.image_size} pixels, {setting} is {image_size}: "
-                "collect the episodes at that size, or set it"
-            )
 
 
 @dataclass
@@ -101,7 +84,7 @@ class TrainingSettings:
     batch: int = 16
     """Samples an update, shared out among the processes."""
     accumulate: int = 1
-    """Parts in which a process computes its share of a batch, one after the other: more need less memory."""
+    """Micro-batches in which a process computes its share of a batch, one after the other: more need less memory."""
     learning_rate: float = 4e-4
     """Peak of the cosine schedule."""
     warmup: int = 100
@@ -120,7 +103,58 @@ class TrainingSettings:
     """Minutes between saved states."""
 
 
-def start(out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: bool = False) -> Accelerator:
+@contextmanager
+def open_data(args: TrainingSettings, image_size: int, setting: str) -> Iterator[tuple[Episodes, Episodes]]:
+    """The training episodes and the held-out ones, for a model that reads frames of `image_size` pixels.
+
+    Args:
+        setting: what that size is called in the model's configuration.
+
+    Raises:
+        SettingsError: if frames have another size.
+        OSError, ValueError: if episodes cannot be read.
+    """
+    with open_episodes(args.data, args.episodes) as episodes, open_episodes(args.val) as held_out:
+        for source in (episodes, held_out):
+            if source.image_size != image_size:
+                raise SettingsError(
+                    f"{source.path} has frames of {source.image_size} pixels, {setting} is {image_size}: "
+                    "collect the episodes at that size, or set it"
+                )
+        yield episodes, held_out
+
+
+class Metrics:
+    """Figures of held-out episodes. Subclasses are frozen dataclasses of numbers, intervals, and None for the rest."""
+
+    group: ClassVar[str] = "val"
+    """What they are listed under in a log."""
+
+    def measured(self) -> dict[str, Any]:
+        """What was measured: the fields that are numbers or intervals."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {
+            name: value for name, value in values.items() if value is not None and not isinstance(value, str)
+        }
+
+    def as_metrics(self) -> dict[str, float]:
+        """What was measured, without intervals, named for a log."""
+        return {
+            f"{self.group}/{name}": float(getattr(value, "value", value))
+            for name, value in self.measured().items()
+        }
+
+    def to_json(self) -> str:
+        """All fields."""
+        return json.dumps(asdict(self), indent=2) + "\n"  # type: ignore[call-overload]
+
+
+M = TypeVar("M", bound=Metrics)
+
+
+def open_run(
+    out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: bool = False
+) -> Accelerator:
     """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
 
     Makes the folder, so that an unwritable one fails before any work.
@@ -145,25 +179,26 @@ def start(out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: b
         # The batch is shared out, not multiplied: the schedule takes one step an update on any number of processes.
         dataloader_config=DataLoaderConfiguration(split_batches=True),
         kwargs_handlers=[
-            InitProcessGroupKwargs(timeout=PATIENCE),
+            InitProcessGroupKwargs(timeout=SYNC_TIMEOUT),
             DistributedDataParallelKwargs(find_unused_parameters=some_unused),
         ],
     )
     if accelerator.num_processes > 1:
-        atexit.register(_part)
+        atexit.register(destroy_group)
     accelerator.init_trackers("training")
     return accelerator
 
 
-def _part() -> None:
+def destroy_group() -> None:
+    """Leave the group of processes, if there is one."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
 
-def finish(accelerator: Accelerator) -> None:
-    """Close the log when all processes are done; another run may `start` afterwards, also in another precision."""
+def close_run(accelerator: Accelerator) -> None:
+    """Close the log when all processes are done; another run may be opened afterwards, also in another precision."""
     accelerator.wait_for_everyone()
-    # Not `end_training`, which parts the processes: they could not meet again for the next run of a study.
+    # Not `end_training`, which also ends the group of processes: the next run of a study could not use it.
     for tracker in accelerator.trackers:
         tracker.finish()
     AcceleratorState._reset_state()
@@ -181,13 +216,13 @@ class Run:
 
         for step in run.steps("predictor"):
             rows = ...                                  # draw the whole batch, keep the rows `run.rows`
-            for part in run.parts():
+            for part in run.micro_batches():
                 run.backward(...)                       # what the rows `part` of these add to the loss of the batch
             run.update(step)
 
     Args:
         args: the stage's settings.
-        accelerator: from `start`.
+        accelerator: from `open_run`.
         module: what is trained. Gradients of several processes meet only if the loss comes from calling `run.module`.
 
     Attributes:
@@ -196,32 +231,32 @@ class Run:
         rows: the rows of every batch that this process computes.
 
     Raises:
-        SettingsError: if a batch has fewer rows than there are parts to compute.
+        SettingsError: if a batch has fewer rows than there are micro-batches.
     """
 
     def __init__(self, args: TrainingSettings, accelerator: Accelerator, module: nn.Module) -> None:
-        parts = accelerator.num_processes * args.accumulate
-        if args.accumulate < 1 or args.batch < parts:
+        count = accelerator.num_processes * args.accumulate
+        if args.accumulate < 1 or args.batch < count:
             raise SettingsError(
                 f"a batch of {args.batch} cannot be shared out among {accelerator.num_processes} processes x "
-                f"{args.accumulate} parts: accumulate must be at least 1, and batch at least {parts}"
+                f"{args.accumulate} micro-batches: accumulate must be at least 1, and batch at least {count}"
             )
         self.args, self.accelerator = args, accelerator
-        edges = [args.batch * part // parts for part in range(parts + 1)]
+        edges = [args.batch * number // count for number in range(count + 1)]
         mine = edges[accelerator.process_index * args.accumulate :][: args.accumulate + 1]
         self.rows = slice(mine[0], mine[-1])
-        self._parts = [slice(a - mine[0], b - mine[0]) for a, b in pairwise(mine)]
+        self._micro_batches = [slice(a - mine[0], b - mine[0]) for a, b in pairwise(mine)]
         learned = [parameter for parameter in module.parameters() if parameter.requires_grad]
         optimizer = torch.optim.Adam(learned, lr=args.learning_rate)
         schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)
         self.module, self._optimizer, self._schedule = accelerator.prepare(module, optimizer, schedule)
-        self._figures: dict[str, Tensor] = {}
+        self._sums: dict[str, Tensor] = {}
         self._bar: Any = None
         # Whether to stop is agreed upon between CPUs: asking the GPUs would make them wait for it at every step.
         # `Any`: what `new_group` says it returns differs between versions of torch.
         self._agreement: Any = None
         if accelerator.num_processes > 1:
-            self._agreement = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
+            self._agreement = torch.distributed.new_group(backend="gloo", timeout=SYNC_TIMEOUT)
         self.first = load_state(accelerator, args.out)
 
     @property
@@ -250,7 +285,7 @@ class Run:
             for step in self._bar:
                 yield step
                 due = time.monotonic() - saved > 60 * self.args.save_minutes
-                due, stop = self._anywhere(due, bool(asked))
+                due, stop = self._any_process(due, bool(asked))
                 if due or stop:
                     save_state(self.accelerator, self.args.out, step + 1)
                     saved = time.monotonic()
@@ -258,58 +293,89 @@ class Run:
                     raise SystemExit(128 + signal.SIGTERM)
         save_state(self.accelerator, self.args.out, self.args.steps)
 
-    def parts(self) -> Iterator[slice]:
-        """The parts of this process's rows, counted from its first; each wants one `backward`."""
-        for number, part in enumerate(self._parts):
-            last = number + 1 == len(self._parts)
+    def micro_batches(self) -> Iterator[slice]:
+        """Parts of this process's rows, counted from its first; each wants one `backward`."""
+        for number, part in enumerate(self._micro_batches):
+            last = number + 1 == len(self._micro_batches)
             # Gradients travel between processes once an update.
             with nullcontext() if last else self.accelerator.no_sync(self.module):
                 yield part
 
-    def share(self, part: slice) -> float:
+    def weight(self, part: slice) -> float:
         """How much of a batch the rows of `part` are: what a mean over them counts in that over the batch."""
         return (part.stop - part.start) / self.args.batch
 
-    def backward(self, loss: Tensor, figures: Mapping[str, Tensor] | None = None) -> None:
-        """Add the gradients of one part.
+    def backward(self, loss: Tensor, metrics: Mapping[str, Tensor] | None = None) -> None:
+        """Add the gradients of one micro-batch.
 
         Args:
-            loss: what the part adds to the loss of the batch.
-            figures: for the log; like the loss they add up over the parts.
+            loss: what it adds to the loss of the batch.
+            metrics: for the log; like the loss they add up over the micro-batches.
         """
         # Gradients are averaged over the processes; they are meant to add up.
         self.accelerator.backward(loss * self.accelerator.num_processes)
-        for name, figure in {"loss/total": loss, **(figures or {})}.items():
-            self._figures[name] = self._figures.get(name, 0.0) + figure.detach()
+        for name, value in {"loss/total": loss, **(metrics or {})}.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value.detach()
 
-    def update(self, step: int, figures: Mapping[str, float] | None = None) -> None:
-        """Take the step that the gradients of all parts ask for, and log now and then.
+    def update(self, step: int, metrics: Mapping[str, float] | None = None) -> None:
+        """Take the step that the gradients ask for, and log now and then.
 
         Args:
-            figures: more for the log, which all processes agree on.
+            metrics: more for the log, which all processes agree on.
         """
         norm = self.accelerator.clip_grad_norm_(self.module.parameters(), self.args.clip_norm)
         self._optimizer.step()
         self._schedule.step()
         self._optimizer.zero_grad()
         if step % LOG_EVERY == 0:
-            sums = self.accelerator.reduce(self._figures, "sum")
+            sums = self.accelerator.reduce(self._sums, "sum")
             values = {name: float(value) for name, value in sums.items()}
-            self.log(step, {**values, "gradient_norm": float(norm), **(figures or {})})
+            self.log(step, {**values, "gradient_norm": float(norm), **(metrics or {})})
             self._bar.set_postfix(
                 {name.removeprefix("loss/"): f"{value:.4f}" for name, value in values.items()}
             )
-        self._figures = {}
+        self._sums = {}
 
-    def log(self, step: int, figures: Mapping[str, float]) -> None:
-        """Log figures of a step; only the main process's count."""
-        self.accelerator.log(dict(figures), step=step)
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Log metrics of a step; only the main process's count."""
+        self.accelerator.log(dict(metrics), step=step)
+
+    def evaluate(
+        self, step: int, measure: Callable[[int | None], Metrics], draw: Callable[[Path], None] | None = None
+    ) -> None:
+        """Every so many updates, measure and log, on the main process.
+
+        Args:
+            measure: the figures of the first so many held-out episodes.
+            draw: write a picture of a few of them.
+        """
+        if not self.is_main or (step + 1) % self.args.evaluate_every:
+            return
+        metrics = measure(self.args.evaluate_episodes)
+        self.log(step, metrics.as_metrics())
+        tqdm.write(f"step {step + 1}: {metrics}")
+        if draw is not None:
+            draw(self.args.out / "samples" / f"{step + 1:06d}.png")
+
+    def finish(self, save: Callable[[Path], Any], measure: Callable[[int | None], M], file: str) -> M | None:
+        """Write `out`/checkpoint, and measure on all held-out episodes into `out`/`file`; main process only.
+
+        Returns:
+            the figures; None on the other processes.
+        """
+        if not self.is_main:
+            return None
+        save(self.args.out / "checkpoint")
+        metrics = measure(None)
+        print(f"final: {metrics}")
+        (self.args.out / file).write_text(metrics.to_json())
+        return metrics
 
     def total(self, amount: Tensor) -> Tensor:
         """The sum over all processes of a tensor that needs no gradient: what a weighted loss is divided by."""
         return self.accelerator.reduce(amount.detach(), "sum")
 
-    def _anywhere(self, *answers: bool) -> tuple[bool, ...]:
+    def _any_process(self, *answers: bool) -> tuple[bool, ...]:
         """Each answer, whether any process gave it: clocks differ and signals do not reach all."""
         if self._agreement is None:
             return answers

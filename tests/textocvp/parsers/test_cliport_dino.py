@@ -20,8 +20,8 @@ from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
 from textocvp.checkpoint import CheckpointError
 from textocvp.config import ModelConfig, with_settings
+from textocvp.data.cache import CacheError
 from textocvp.data.episodes import EpisodeFile
-from textocvp.data.feature_cache import FeatureCacheError
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.parsers.dino import DinoEncoder
@@ -34,7 +34,7 @@ from textocvp.slots import SlotLayout
 from textocvp.training import parser as train_parser
 from textocvp.training import predictor as train_predictor
 from textocvp.training.losses import thing_weights
-from textocvp.training.parser import ParserTraining, parser_loss
+from textocvp.training.parser import ParserStage, ParserTraining
 from textocvp.training.predictor import PredictorTraining
 from textocvp.training.run import SettingsError
 from textocvp.world_model import WorldModel
@@ -134,14 +134,14 @@ def test_slots_are_exchangeable(weights: Path) -> None:
 def test_stage_one_learns_from_pixels_and_from_features_unclamped(weights: Path) -> None:
     model = build(weights)
     clips = frames()
-    loss = parser_loss(model, clips, thing_weights(clips.flatten(0, 1), 0.0))
+    loss = ParserStage(model)(clips, thing_weights(clips.flatten(0, 1), 0.0))
     parsed = model.parser(clips)
     assert parsed.features_BTLF is not None and parsed.features_BTLF.abs().max() > 1
     zero = build(weights)
     with torch.no_grad():
         for parameter in zero.renderer.parameters():
             parameter.zero_()
-    nothing = parser_loss(zero, clips, thing_weights(clips.flatten(0, 1), 0.0))
+    nothing = ParserStage(zero)(clips, thing_weights(clips.flatten(0, 1), 0.0))
     # A renderer that draws zeros errs by the mean square of what it should draw.
     torch.testing.assert_close(nothing.feature, parsed.features_BTLF.square().mean())
     torch.testing.assert_close(nothing.image, clips.square().mean())
@@ -250,22 +250,22 @@ def test_encoding_goes_on_where_it_was_killed_and_refuses_what_is_not_its_own(
     with EpisodeFile(args.data) as episodes, h5py.File(parts[1]) as file:
         encoder = DinoEncoder(args.set[0].partition("=")[2], dim=DIM, patch=PATCH)
         wanted = encoder(to_frames(episodes.episode(17).frames[None])[0])
-        assert np.array_equal(file["features"][-4:], wanted.half().numpy())
+        assert np.array_equal(file["values"][-4:], wanted.half().numpy())
 
     parts[1].unlink()  # as after a kill
     before = parts[0].stat().st_mtime_ns
     train_parser.train(dataclasses.replace(args, steps=2))
     assert parts[1].exists() and parts[0].stat().st_mtime_ns == before
 
-    with pytest.raises(FeatureCacheError, match="another episodes"):
+    with pytest.raises(CacheError, match="from other episodes"):
         train_parser.train(dataclasses.replace(args, steps=3, episodes=17))
     wrong = write_tiny_dino(tmp_path / "wrong", seed=1)
-    with pytest.raises(FeatureCacheError, match="another encoder"):
+    with pytest.raises(CacheError, match="by another network"):
         train_parser.train(dataclasses.replace(args, steps=3, set=(f"parser.encoder_weights={wrong}",)))
     parts[0].write_bytes(b"nothing")
-    with pytest.raises(FeatureCacheError, match="damaged"):
+    with pytest.raises(CacheError, match="damaged"):
         train_parser.train(dataclasses.replace(args, steps=3))
-    with pytest.raises(SettingsError, match="cache_features needs a parser with a frozen encoder"):
+    with pytest.raises(SettingsError, match="cache_features needs a frozen image encoder"):
         train_parser.train(
             stage_one("conv", "parser.image_size=32", preset="savi-small", cache_features=True)
         )

@@ -24,7 +24,7 @@ from textocvp.renderers.patches import (
 )
 from textocvp.slots import SlotLayout, moments
 from textocvp.training.losses import read_place_loss, thing_weights
-from textocvp.training.parser import parser_loss
+from textocvp.training.parser import ParserStage
 
 LAYOUT = SlotLayout(content=6, explicit=False)
 
@@ -135,7 +135,7 @@ def test_stage_one_reaches_every_parameter(initializer: str, prior: str) -> None
     frames = torch.full((2, 2, 3, 32, 32), -0.6)
     frames[:, :, 0, 4:12, 4:12] = 0.8
     frames[:, :, 2, 18:26, 10:16] = 0.8
-    loss = parser_loss(model, frames, thing_weights(frames.flatten(0, 1), 4.0))
+    loss = ParserStage(model)(frames, thing_weights(frames.flatten(0, 1), 4.0))
     assert (loss.place > 0) == (prior == "true") and loss.mask == 0
     loss.total(0.1, 0.1, 0.0).backward()
     for name, parameter in [*model.parser.named_parameters(), *model.renderer.named_parameters()]:

@@ -1,8 +1,9 @@
 """The second half of MAGE: codes of the frames so far, and text, to codes of the next frame.
 
 "Make It Move" (CVPR 2022), sections 3.3 and 3.4. The motion anchor is one cross-attention block from the tokens of the
-first frame to the words. It stands at time step 0, the frames follow; six axial layers, causal in time; from what they
-say at each frame a linear layer scores the codes of the next. All codes of a frame are predicted at once.
+first frame to the words. It stands at time step 0, the frames follow. Each layer attends along one axis ("Axial
+Attention in Multidimensional Transformers", Ho et al. 2019), and causally in time. From each frame a linear layer
+scores the codes of the next, all at once.
 
 Shape suffixes: B videos, T frames, h and w codes along a side of a frame, g tokens along a side, P codes of a token,
 C width, K codes in the codebook, L words.
@@ -10,18 +11,80 @@ C width, K codes in the codebook, L words.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.baselines.mage.attention import AXES, AxialBlock, BiasedAttention, FeedForward
-from textocvp.baselines.mage.config import AxialConfig
-from textocvp.layers import MASKED, KeyValueCache
+from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
+from textocvp.layers import KeyValueCache
+from textocvp.predictors.base import mask_bias
 from textocvp.text.base import TextTokens
+
+Axis = Literal["time", "height", "width"]
+AXES: tuple[Axis, ...] = ("time", "height", "width")  # in the order of the dimensions after B
+
+
+@dataclass(frozen=True)
+class AxialConfig:
+    """From the codes of the past, and text, to the codes of the next frame.
+
+    Attributes:
+        dim: token width.
+        layers: of the transformer, one axis each: time, height, width, time, ...
+        heads: of its attention.
+        hidden: width of its feed-forward nets.
+        frames: the longest video, in frames, the seen one included.
+        patch: side of the square of codes that make one token. 1 as published; 2 makes a frame of 16x16 codes 64
+            tokens and so four times as cheap, with all codes of a frame still predicted at once.
+        copy: add a bonus, read off the token, to the score of the code that a place has now, and of the one it had in
+            the first frame. So the model need not learn code by code to leave a place as it is. Not published; for
+            training in minutes.
+    """
+
+    dim: int = 512
+    layers: int = 6
+    heads: int = 16
+    hidden: int = 2048
+    frames: int = 20
+    patch: int = 1
+    copy: bool = False
+
+
+class AxialBlock(nn.Module):
+    """Pre-norm transformer block whose attention runs along one axis of a video.
+
+    Along time it is causal: no frame sees a later one. Along height and width all tokens of a frame see each other.
+    """
+
+    def __init__(self, axis: Axis, dim: int, heads: int, hidden: int) -> None:
+        super().__init__()
+        self.axis = axis
+        self.norm_attention = nn.LayerNorm(dim)
+        self.attention = BiasedAttention(dim, heads)
+        self.norm_feed_forward = nn.LayerNorm(dim)
+        self.feed_forward = FeedForward(dim, hidden)
+
+    def forward(self, x_BTggC: Tensor, cache: KeyValueCache | None = None) -> Tensor:
+        """The block on frames; with a `cache` (for `time` blocks only) they follow those seen before."""
+        x_BTggC = x_BTggC + self._attend(self.norm_attention(x_BTggC), cache)
+        return x_BTggC + self.feed_forward(self.norm_feed_forward(x_BTggC))
+
+    def _attend(self, x_BTggC: Tensor, cache: KeyValueCache | None) -> Tensor:
+        axis = 1 + AXES.index(self.axis)
+        moved = x_BTggC.movedim(axis, -2)
+        bias_TM, T = None, x_BTggC.shape[1]
+        if self.axis == "time" and T > 1:
+            past = 0 if cache is None else cache.length
+            bias_TM = x_BTggC.new_full((T, past + T), float("-inf")).triu(past + 1)
+        found_XNC = self.attention(moved.flatten(0, -3), bias_TM, cache=cache)
+        return found_XNC.view(moved.shape).movedim(-2, axis)
 
 
 class MotionAnchor(nn.Module):
-    """What the words say to each place of the first frame: cross-attention, then a feed-forward net."""
+    """What the words mean for each place of the first frame: cross-attention, then a feed-forward net."""
 
     def __init__(self, dim: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -32,20 +95,18 @@ class MotionAnchor(nn.Module):
         self.feed_forward = FeedForward(dim, hidden)
 
     def forward(self, tokens_BggC: Tensor, text: TextTokens) -> Tensor:
-        """(B, g, g, C). Words that are padding are not heard."""
-        bias_B11L = torch.zeros_like(text.mask_BL, dtype=tokens_BggC.dtype).masked_fill(~text.mask_BL, MASKED)
+        """(B, g, g, C). Padding is masked."""
+        bias_B11L = mask_bias(~text.mask_BL)[:, None, None]
         x_BNC = tokens_BggC.flatten(1, 2)
         x_BNC = x_BNC + self.attention(
-            self.norm_tokens(x_BNC),
-            bias_B11L[:, None, None],
-            context_XMC=self.norm_text(text.embeddings_BLC),
+            self.norm_tokens(x_BNC), bias_B11L, context_XMC=self.norm_text(text.embeddings_BLC)
         )
         x_BNC = x_BNC + self.feed_forward(self.norm_feed_forward(x_BNC))
         return x_BNC.view(tokens_BggC.shape)
 
 
 class AxialTransformer(nn.Module):
-    """Codes and text to scores of the codes to come.
+    """Codes and text to scores of the next codes.
 
     Args:
         config: sizes.
@@ -99,22 +160,22 @@ class AxialTransformer(nn.Module):
         return patches.unflatten(-1, (p, p)).transpose(-3, -2).reshape(*lead, rows * p, columns * p)
 
     def tokens(self, codes_BThw: Tensor) -> Tensor:
-        """Codes to tokens (B, T, g, g, C), each aware of its neighbours and of where it is."""
+        """Codes to tokens (B, T, g, g, C), each mixed with its neighbours and marked with its place."""
         x_BTggC = self.embedding(self.patches(codes_BThw)).flatten(-2)
         B, T = x_BTggC.shape[:2]
         mixed_NCgg = self.neighbours(x_BTggC.flatten(0, 1).permute(0, 3, 1, 2))
         x_BTggC = mixed_NCgg.permute(0, 2, 3, 1).unflatten(0, (B, T))
         return x_BTggC + self.height_gC[:, None] + self.width_gC
 
-    def start(self, first_BggC: Tensor, text: TextTokens, speed_B: Tensor) -> Tensor:
-        """The motion anchor (B, 1, g, g, C), as the layers read it.
+    def start(self, codes_BThw: Tensor, text: TextTokens, speed_B: Tensor) -> Tensor:
+        """What the layers read (B, 1 + T, g, g, C): the motion anchor, then the frames.
 
         Args:
-            first_BggC: `tokens` of the first frame.
             speed_B: episode frames between two frames of the video.
         """
-        anchor_BggC = self.anchor(first_BggC, text) + speed_B[:, None, None, None] * self.speed_C
-        return self.enter_anchor(anchor_BggC)[:, None]
+        tokens_BTggC = self.tokens(codes_BThw)
+        anchor_BggC = self.anchor(tokens_BTggC[:, 0], text) + speed_B[:, None, None, None] * self.speed_C
+        return torch.cat([self.enter_anchor(anchor_BggC)[:, None], self.enter_frames(tokens_BTggC)], dim=1)
 
     def layers(self, x_BTggC: Tensor, caches: list[KeyValueCache] | None = None) -> Tensor:
         """The axial layers, from the time step after those in the `caches`, one for each layer along time."""
@@ -135,13 +196,11 @@ class AxialTransformer(nn.Module):
         T = codes_BThw.shape[1]
         if self.config.frames <= T:
             raise ValueError(f"at most {self.config.frames - 1} frames can be read, not {T}: axial.frames")
-        tokens_BTggC = self.tokens(codes_BThw)
-        anchor_B1ggC = self.start(tokens_BTggC[:, 0], text, speed_B)
-        x_BTggC = self.layers(torch.cat([anchor_B1ggC, self.enter_frames(tokens_BTggC)], dim=1))[:, 1:]
+        x_BTggC = self.layers(self.start(codes_BThw, text, speed_B))[:, 1:]
         return self.scores(x_BTggC, codes_BThw, codes_BThw[:, :1])
 
     def scores(self, x_BTggC: Tensor, codes_BThw: Tensor, first_B1hw: Tensor) -> Tensor:
-        """(B, T, g, g, P, K) from what the layers say, the codes of these frames, and those of the first frame."""
+        """(B, T, g, g, P, K) from the layers' output, the codes of these frames, and those of the first frame."""
         P = self.config.patch**2
         scores_BTggPK = self.out(x_BTggC).unflatten(-1, (P, -1))
         if self.keep is None:
@@ -153,21 +212,13 @@ class AxialTransformer(nn.Module):
 
     @torch.no_grad()
     def imagine(
-        self,
-        seen_BThw: Tensor,
-        text: TextTokens,
-        horizon: int,
-        speed_B: Tensor | None = None,
-        *,
-        use_cache: bool = True,
+        self, seen_BThw: Tensor, text: TextTokens, horizon: int, speed_B: Tensor | None = None
     ) -> Tensor:
         """The likeliest codes (B, horizon, h, w) of the frames after the seen ones, each fed back (greedy decoding).
 
         Args:
             seen_BThw: true codes, T frames from the first one on.
             speed_B: episode frames between two frames; 1 by default.
-            use_cache: keep keys and values of past frames; without it they are computed again at every step (slower,
-                the same up to rounding; for checks).
 
         Raises:
             ValueError: if seen and imagined frames are more than `config.frames`.
@@ -177,19 +228,9 @@ class AxialTransformer(nn.Module):
             raise ValueError(
                 f"{T} seen and {horizon} imagined frames: at least one of each, at most {self.config.frames} in all"
             )
-        if speed_B is None:
-            speed_B = self.speed_C.new_ones(B)
-        if not use_cache:
-            codes_BThw = seen_BThw
-            for _ in range(horizon):
-                scores_BggPK = self(codes_BThw, text, speed_B)[:, -1]
-                codes_BThw = torch.cat([codes_BThw, self.frames(scores_BggPK.argmax(-1))[:, None]], dim=1)
-            return codes_BThw[:, T:]
         along_time = sum(block.axis == "time" for block in self.blocks)
         caches = [KeyValueCache(self.config.frames) for _ in range(along_time)]
-        tokens_BTggC = self.tokens(seen_BThw)
-        anchor_B1ggC = self.start(tokens_BTggC[:, 0], text, speed_B)
-        x_BTggC = torch.cat([anchor_B1ggC, self.enter_frames(tokens_BTggC)], dim=1)
+        x_BTggC = self.start(seen_BThw, text, self.speed_C.new_ones(B) if speed_B is None else speed_B)
         newest_B1hw, imagined = seen_BThw[:, -1:], []
         for _ in range(horizon):
             scores_B1ggPK = self.scores(self.layers(x_BTggC, caches)[:, -1:], newest_B1hw, seen_BThw[:, :1])

@@ -1,26 +1,65 @@
-"""MAGE in one module, and its checkpoint."""
+"""MAGE in one module, its checkpoint, and the form in which users meet it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from textocvp.baselines.mage.axial import AxialTransformer
-from textocvp.baselines.mage.checkpoint import write
-from textocvp.baselines.mage.config import ARCHITECTURE, MageConfig
-from textocvp.baselines.mage.text import build_text
-from textocvp.baselines.mage.vqvae import VQVAE
-from textocvp.checkpoint import CONFIG_FILE, WEIGHTS_FILE, CheckpointError, load_weights, read_json
-from textocvp.model import TEXT_FOLDER
+from textocvp.baselines.mage.axial import AxialConfig, AxialTransformer
+from textocvp.baselines.mage.text import TEXT_ENCODERS, PublishedTextConfig
+from textocvp.baselines.mage.vqvae import VQVAE, VQVAEConfig, read_checkpoint
+from textocvp.checkpoint import TEXT_FOLDER, Checkpoint, write_checkpoint
+from textocvp.config import build
+from textocvp.inputs import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
+from textocvp.text import TextConfig
 
+ARCHITECTURE: Literal["mage"] = "mage"
 AT_ONCE = 64  # frames to decode: more take more memory, and on a CPU more time each
 
 
+@dataclass(frozen=True)
+class MageConfig:
+    """A whole MAGE.
+
+    Attributes:
+        KINDS: of each part, the classes that its `kind` names.
+        name: the preset it came from.
+        vqvae: frames to codes and back.
+        text: sentences to tokens.
+        axial: codes and tokens to the next codes.
+        architecture: always `mage`; tells its checkpoints from others.
+    """
+
+    KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {"text": TEXT_ENCODERS}
+
+    name: str
+    vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
+    text: TextConfig = field(default_factory=PublishedTextConfig)
+    axial: AxialConfig = field(default_factory=AxialConfig)
+    architecture: Literal["mage"] = ARCHITECTURE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionaries, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> MageConfig:
+        """The inverse of `to_dict`.
+
+        Raises:
+            ValueError: see `textocvp.config.build`.
+        """
+        return build(cls, data)
+
+
 class Mage(nn.Module):
-    """Frames to codes, codes and text to the codes to come, codes to frames ("Make It Move", CVPR 2022, figure 2).
+    """Frames to codes, codes and text to the next codes, codes to frames ("Make It Move", CVPR 2022, figure 2).
 
     Attributes:
         vqvae: frames to codes and back.
@@ -36,15 +75,10 @@ class Mage(nn.Module):
 
     def __init__(self, config: MageConfig, text_files: Path | None = None) -> None:
         super().__init__()
-        self.vqvae = VQVAE(config.vqvae)
-        self.text = build_text(config.text, text_files)
-        self._config = config
-        self.axial = AxialTransformer(
-            config.axial,
-            config.vqvae.grid,
-            config.vqvae.codebook_size,
-            config.text.dim,
-        )
+        self._config, vqvae = config, config.vqvae
+        self.vqvae = VQVAE(vqvae)
+        self.text = TEXT_ENCODERS[config.text.kind](config.text, text_files)
+        self.axial = AxialTransformer(config.axial, vqvae.grid, vqvae.codebook_size, config.text.dim)
 
     @property
     def config(self) -> MageConfig:
@@ -57,35 +91,26 @@ class Mage(nn.Module):
         return self.axial.time_TC.device
 
     @torch.no_grad()
-    def take_vqvae(self, trained: VQVAE) -> None:
-        """Take over a trained VQ-VAE of the same configuration, frozen from now on."""
-        self.vqvae.load_state_dict(trained.state_dict())
-        self.vqvae.requires_grad_(False).eval()
-
-    @torch.no_grad()
-    def imagine(
-        self, first_B3HW: Tensor, texts: list[str], horizon: int, *, use_cache: bool = True
-    ) -> Tensor:
+    def imagine(self, first_B3HW: Tensor, texts: list[str], horizon: int) -> Tensor:
         """Frames (B, horizon + 1, 3, H, W), about -1..1; the first is the given one as the VQ-VAE redraws it.
 
         Args:
             first_B3HW: frames in -1..1.
             texts: one sentence a frame.
             horizon: how many frames to imagine.
-            use_cache: see `AxialTransformer.imagine`.
 
         Raises:
             ValueError: if the horizon is longer than the model was made for, or a text is not allowed.
         """
         seen_B1hw = self.vqvae.encode(first_B3HW)[:, None]
-        imagined_BShw = self.axial.imagine(seen_B1hw, self.text(texts), horizon, use_cache=use_cache)
+        imagined_BShw = self.axial.imagine(seen_B1hw, self.text(texts), horizon)
         codes_BThw = torch.cat([seen_B1hw, imagined_BShw], dim=1)
         drawn = [self.vqvae.decode(part) for part in codes_BThw.flatten(0, 1).split(AT_ONCE)]
         return torch.cat(drawn).unflatten(0, codes_BThw.shape[:2])
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint."""
-        write(self, self.config.to_dict(), folder)
+        write_checkpoint(folder, self, self.config.to_dict())
         self.text.save_files(folder / TEXT_FOLDER)
 
     @classmethod
@@ -96,13 +121,73 @@ class Mage(nn.Module):
             CheckpointError: if a file is missing or damaged, it is of another architecture, or a config field or tensor
                 does not fit; it is named.
         """
-        data = read_json(folder)
-        found = data.get("architecture", "textocvp")
-        if found != ARCHITECTURE:
-            raise CheckpointError(f"{folder} holds a {found!r} model, and this needs one of {ARCHITECTURE!r}")
-        try:
-            model = cls(MageConfig.from_dict(data), folder / TEXT_FOLDER)
-        except (ValueError, TypeError) as error:
-            raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-        load_weights(model, folder / WEIGHTS_FILE)
-        return model.to(device).eval()
+        files = folder / TEXT_FOLDER
+        model = read_checkpoint(folder, ARCHITECTURE, lambda data: cls(MageConfig.from_dict(data), files))
+        return model.to(device)
+
+
+class MageVideoModel:
+    """A `textocvp.protocols.VideoModel` without slots: it imagines frames and nothing else.
+
+    Attributes:
+        model: the network.
+        checkpoint: where it came from.
+    """
+
+    def __init__(self, model: Mage, checkpoint: Checkpoint | None = None) -> None:
+        self.model = model.eval()
+        self.checkpoint = checkpoint or Checkpoint(model.config.name)
+
+    @classmethod
+    def from_folder(cls, folder: Path, name: str, device: str | torch.device = "cpu") -> MageVideoModel:
+        """Load a checkpoint.
+
+        Args:
+            name: what to call it.
+
+        Raises:
+            CheckpointError: see `Mage.load`.
+        """
+        return cls(Mage.load(folder, device), Checkpoint.of(folder, name))
+
+    def __repr__(self) -> str:
+        million = sum(p.numel() for p in self.model.parameters()) / 1e6
+        H, W = self.image_size
+        return (
+            f"MageVideoModel({self.checkpoint.name!r}, {million:.1f} M parameters, {H}x{W} frames, "
+            f"up to {self.longest_horizon} frames ahead, on {self.model.device})"
+        )
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) of the only frames that it understands, in pixels."""
+        side = self.model.config.vqvae.image_size
+        return side, side
+
+    @property
+    def longest_horizon(self) -> int:
+        """How many frames it can imagine at once: it has no code for later times."""
+        return self.model.config.axial.frames - 1
+
+    @torch.no_grad()
+    def imagine(
+        self, obs: Mapping[str, Any] | np.ndarray, text: str | Sequence[str], *, horizon: int, seed: int = 0
+    ) -> Tensor:
+        """Frames (B, horizon + 1, 3, H, W), RGB 0..1, float32, as `textocvp.protocols.VideoModel.imagine`.
+
+        Args:
+            seed: changes nothing: this model draws nothing at random.
+
+        Raises:
+            TypeError: if the observation is not uint8, or a text no string.
+            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says what is.
+
+        A word that the text encoder has never met is a `UserWarning` that names the word.
+        """
+        texts = checked_texts(text, self.model.text)
+        checked_horizon(horizon, self.longest_horizon)
+        frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)
+        B = checked_pairs(len(frames_B3HW), len(texts))
+        texts = texts * B if len(texts) == 1 else texts
+        frames_BT3HW = self.model.imagine(frames_B3HW.expand(B, -1, -1, -1), texts, horizon)
+        return ((frames_BT3HW + 1) / 2).clamp(0, 1)

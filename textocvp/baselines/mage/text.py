@@ -5,24 +5,45 @@
 
 from __future__ import annotations
 
-import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from textocvp.baselines.mage.attention import BiasedAttention, FeedForward
-from textocvp.baselines.mage.config import PublishedTextConfig
-from textocvp.layers import MASKED
-from textocvp.text import TextConfig, build_text_encoder
-from textocvp.text.base import RGB, TextEncoder, TextTokens, WordBatch
-from textocvp.text.words import GRAMMAR, TRAIN_COLORS
+from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
+from textocvp.predictors.base import mask_bias
+from textocvp.text import ENCODERS
+from textocvp.text.base import TextEncoder, TextTokens, WordBatch
+from textocvp.text.words import GRAMMAR, PAD, TRAIN_COLORS, UNKNOWN, WordEncoder, WordsConfig
 
-WORDS = ("<pad>", "<unk>", *GRAMMAR, *TRAIN_COLORS)
-"""Row by row; the order is part of every checkpoint: append."""
-PAD, UNKNOWN = 0, 1
+FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding: no word here stands for all colours
 
-_WORD = re.compile(r"[a-z0-9']+")
+
+@dataclass(frozen=True)
+class PublishedTextConfig(WordsConfig):
+    """Options of `PublishedText`.
+
+    Attributes:
+        rows: of the word embedding. Published are more than there are words; the rest is never used.
+    """
+
+    kind: Literal["published"] = "published"  # type: ignore[assignment]
+    dim: int = 512
+    max_tokens: int = 32
+    heads: int = 16
+    hidden: int = 2048
+    vocabulary: tuple[str, ...] = GRAMMAR + TRAIN_COLORS
+    rows: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted = FIRST_WORD + len(self.vocabulary)
+        if self.rows < wanted:
+            raise ValueError(
+                f"text.rows must be at least {wanted} for the words of text.vocabulary, not {self.rows}"
+            )
 
 
 class _PostNormBlock(nn.Module):
@@ -38,23 +59,16 @@ class _PostNormBlock(nn.Module):
         return self.norm_feed_forward(x_BLC + self.feed_forward(x_BLC))
 
 
-class PublishedText(TextEncoder):
-    """Words to tokens. Padding is masked, so what a sentence means does not depend on its neighbours in the batch.
+class PublishedText(WordEncoder):
+    """Splits sentences into words as `WordEncoder` does, and encodes them with a network of its own."""
 
-    Raises:
-        ValueError: if the embedding has fewer rows than there are words.
-    """
+    Config = PublishedTextConfig  # type: ignore[assignment]
+    config: PublishedTextConfig
 
-    pad = PAD
-    config: PublishedTextConfig  # type: ignore[assignment]
-
-    def __init__(self, config: PublishedTextConfig) -> None:
-        super().__init__(config)  # type: ignore[arg-type]
-        if config.vocabulary < len(WORDS):
-            raise ValueError(f"text.vocabulary must be at least {len(WORDS)}, not {config.vocabulary}")
-        self.config = config
-        self._numbers = {word: row for row, word in enumerate(WORDS)}
-        self.embedding = nn.Embedding(config.vocabulary, config.dim, padding_idx=PAD)
+    def __init__(self, config: PublishedTextConfig, files: Path | None = None) -> None:
+        TextEncoder.__init__(self, config)  # without the weights of a `WordEncoder`
+        self._vocabulary = {word: row for row, word in enumerate(config.vocabulary, start=FIRST_WORD)}
+        self.embedding = nn.Embedding(config.rows, config.dim, padding_idx=PAD)
         self.positions_LC = nn.Parameter(torch.empty(config.max_tokens, config.dim))
         for weight in (self.embedding.weight, self.positions_LC):
             nn.init.normal_(weight, std=0.02)
@@ -65,38 +79,17 @@ class PublishedText(TextEncoder):
         self.norm = nn.LayerNorm(config.dim)
         self.project = nn.Linear(config.dim, config.dim)
 
-    @property
-    def device(self) -> torch.device:
-        return self.embedding.weight.device
-
-    def words(self, text: str) -> list[str]:
-        """The words of a sentence, lower case, one a token."""
-        return _WORD.findall(text.lower())
-
-    def unknown_words(self, text: str) -> list[str]:
-        return list(dict.fromkeys(word for word in self.words(text) if word not in self._numbers))
-
-    def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
-        return [(self._numbers.get(word, UNKNOWN), None) for word in self.words(text)]
-
     def encode(self, words: WordBatch) -> TextTokens:
         mask_BL = words.ids_BL != PAD
         length = mask_BL.shape[1]
         self._check_length(length, "this batch")
         x_BLC = self.norm_words(self.embedding(words.ids_BL) + self.positions_LC[:length])
-        bias_B11L = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, MASKED)[:, None, None]
+        bias_B11L = mask_bias(~mask_BL)[:, None, None]
         for block in self.blocks:
             x_BLC = block(x_BLC, bias_B11L)
         x_BLC = self.project(self.norm(x_BLC)) * mask_BL[..., None]
         return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
 
 
-def build_text(config: TextConfig | PublishedTextConfig, files: Path | None = None) -> TextEncoder:
-    """The text encoder of a MAGE: its own, or any of TextOCVP's.
-
-    Raises:
-        ValueError: as `textocvp.text.build_text_encoder`.
-    """
-    if isinstance(config, PublishedTextConfig):
-        return PublishedText(config)
-    return build_text_encoder(config, files)
+TEXT_ENCODERS: dict[str, type[TextEncoder]] = {**ENCODERS, "published": PublishedText}
+"""What `text.kind` of a MAGE names: its own encoder, or any of TextOCVP's."""

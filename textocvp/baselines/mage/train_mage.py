@@ -11,32 +11,35 @@ that it imagined itself, from which it must predict the true next codes (dataset
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from textocvp.baselines.mage.axial import code_loss
-from textocvp.baselines.mage.checkpoint import load_vqvae
-from textocvp.baselines.mage.codes import CodeCache, cached_codes
-from textocvp.baselines.mage.config import mage_preset
-from textocvp.baselines.mage.evaluation import Imagined, measure
 from textocvp.baselines.mage.model import Mage
+from textocvp.baselines.mage.presets import mage_preset
+from textocvp.baselines.mage.vqvae import VQVAE, load_vqvae
 from textocvp.config import with_settings
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data.cache import FrameCache, weights_fingerprint
+from textocvp.data.episodes import Episodes
+from textocvp.metrics import psnr
+from textocvp.model import evaluating
+from textocvp.parsers.base import to_frames
 from textocvp.text.base import WordBatch
 from textocvp.training.run import (
+    Metrics,
     Run,
     SettingsError,
     TrainingSettings,
     allowed_settings,
-    check_frame_size,
-    finish,
-    start,
+    close_run,
+    open_data,
+    open_run,
     step_rng,
 )
 
@@ -55,13 +58,39 @@ class MageTraining(TrainingSettings):
     learning_rate: float = 1e-3
     warmup: int = 100
     stride: int = 1
-    """Episode frames between two frames of a video, drawn from 1 to this; the model is told."""
+    """Episode frames between two frames of a video, drawn from 1 to this; an input of the model."""
     changed_weight: float = 5.0
     """How much more a code counts that is not that of the first frame."""
     autoregressive: float = 0.3
     """Share of the updates, the last ones, that learn from imagined frames; 0 as published."""
     evaluate_every: int = 300
     evaluate_episodes: int = 16
+
+
+@dataclass(frozen=True)
+class PredictionMetrics(Metrics):
+    """How well rollouts from the first frame to the longest horizon are predicted.
+
+    Attributes:
+        psnr: mean peak signal-to-noise ratio of the imagined frames, in dB.
+        still_psnr: what it would be if the first frame, redrawn, never changed.
+        redrawn_psnr: what it would be if every code were right: the VQ-VAE's own.
+        codes: share of the imagined codes that are right.
+        changed_codes: the same over the codes that are not those of the first frame.
+    """
+
+    psnr: float
+    still_psnr: float
+    redrawn_psnr: float
+    codes: float
+    changed_codes: float
+
+    def __str__(self) -> str:
+        return (
+            f"imagined at {self.psnr:.2f} dB (nothing moves {self.still_psnr:.2f}, all codes right "
+            f"{self.redrawn_psnr:.2f}); {100 * self.codes:.1f} % of the codes right, "
+            f"{100 * self.changed_codes:.1f} % of those that change"
+        )
 
 
 class MageStage(nn.Module):
@@ -85,56 +114,57 @@ class MageStage(nn.Module):
         return self.axial(seen_BThw, text, speed_B)
 
 
-def train(args: MageTraining) -> Imagined | None:
-    """Run or continue stage 2; writes `out`/checkpoint, a whole model, and returns its figures on all of `val`.
+def train(args: MageTraining) -> PredictionMetrics | None:
+    """Run or continue stage 2; writes `out`/checkpoint, a whole model.
 
-    They are None on all processes but the main one.
+    Returns:
+        the metrics of all held-out episodes; None on all processes but the main one.
 
     Raises:
         CheckpointError: if `vqvae` is no checkpoint of a VQ-VAE.
-        CodeCacheError: if `out` holds codes of another VQ-VAE or of other episodes.
+        CacheError: if `out` holds codes of another VQ-VAE or of other episodes.
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
-    accelerator = start(args.out, args.precision)
+    accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
-    model = assemble(args).to(accelerator.device)
-    run, figures = Run(args, accelerator, MageStage(model)), None
-    with EpisodeFile(args.data, first=args.episodes) as episodes, EpisodeFile(args.val) as held_out:
-        check_frame_size(model.config.vqvae.image_size, "vqvae.image_size", episodes, held_out)
-        with accelerator.main_process_first():
-            cache = cached_codes(model.vqvae, episodes, args.out / "codes-train.h5")
+    vqvae = load_vqvae(args.vqvae)
+    with open_data(args, vqvae.config.image_size, "vqvae.image_size") as (episodes, held_out):
+        model = assemble(args, vqvae, episodes).to(accelerator.device)
+        run, frames = Run(args, accelerator, MageStage(model)), model.config.axial.frames
+
+        def measured(count: int | None) -> PredictionMetrics:
+            return measure(model, held_out, range(len(held_out))[:count])
+
+        share = (accelerator.process_index, accelerator.num_processes)
+        cache = cached_codes(model.vqvae, episodes, args.out / "codes-train", *share)
+        accelerator.wait_for_everyone()
         words = model.text.lookup(episodes.instructions)
         for step in run.steps("mage"):
             rng = step_rng(args.seed, step)
-            imagined = next_imagined(args, step, model.config.axial.frames, rng)
-            codes_BThw, speed, chosen = draw(args, cache, model.config.axial.frames, rng, run.rows)
-            codes_BThw = codes_BThw.to(run.device)
+            imagined = schedule(args, step, frames, rng)
+            stride = int(rng.integers(1, args.stride + 1))
+            chosen_B = rng.integers(len(cache), size=args.batch)[run.rows]
+            clips = cache.at(chosen_B, stride * np.arange(frames)).astype(np.int64)
+            codes_BThw = torch.from_numpy(clips).to(run.device)
             weights_BThw = 1 + args.changed_weight * (codes_BThw[:, 1:] != codes_BThw[:, :1])
             whole = run.total(weights_BThw.sum())
-            for part in run.parts():
+            for part in run.micro_batches():
                 codes, weights = codes_BThw[part], model.axial.patches(weights_BThw[part])
-                seen, target = codes[:, : codes.shape[1] - 1 - imagined], model.axial.patches(codes[:, 1:])
-                speed_B = torch.full((len(codes),), float(speed), device=run.device)
+                seen, target = codes[:, : frames - 1 - imagined], model.axial.patches(codes[:, 1:])
+                speed_B = torch.full((len(codes),), float(stride), device=run.device)
+                sentences = words.select(torch.from_numpy(chosen_B[part]))
                 with accelerator.autocast():
-                    scores = run.module(seen, words.select(chosen[part]), speed_B, imagined)
+                    scores = run.module(seen, sentences, speed_B, imagined)
                 run.backward(code_loss(scores, target, weights) / whole)
             run.update(step, {"imagined": float(imagined)})
-
-            if run.is_main and (step + 1) % args.evaluate_every == 0:
-                figures = measure(model, held_out, range(min(args.evaluate_episodes, len(held_out))))
-                run.log(step, {f"val/{name}": value for name, value in asdict(figures).items()})
-                tqdm.write(f"step {step + 1}: {figures}")
-        if run.is_main:
-            model.save(args.out / "checkpoint")
-            figures = measure(model, held_out, range(len(held_out)))
-            print(f"final: {figures}")
-            (args.out / "imagined.json").write_text(json.dumps(asdict(figures), indent=2) + "\n")
-    finish(accelerator)
-    return figures
+            run.evaluate(step, measured)
+        metrics = run.finish(model.save, measured, "imagined.json")
+    close_run(accelerator)
+    return metrics
 
 
-def assemble(args: MageTraining) -> Mage:
-    """A model with the trained VQ-VAE, frozen, and a text encoder and a transformer to train.
+def assemble(args: MageTraining, vqvae: VQVAE, episodes: Episodes) -> Mage:
+    """A model with the trained VQ-VAE, frozen, and a transformer and a text encoder for the episodes' words to train.
 
     Raises:
         SettingsError: if a setting is of the VQ-VAE.
@@ -142,15 +172,43 @@ def assemble(args: MageTraining) -> Mage:
     for setting in args.set:
         if setting.startswith(("vqvae", "name", "architecture")):
             raise SettingsError(f"{setting!r}: the VQ-VAE comes trained; set text.* and axial.* only")
-    vqvae = load_vqvae(args.vqvae)
-    config = replace(with_settings(mage_preset(args.preset), args.set), vqvae=vqvae.config)
     with allowed_settings():
-        model = Mage(config)
-    model.take_vqvae(vqvae)
+        config = with_settings(mage_preset(args.preset), args.set)
+        text = config.text.for_captions(episodes.instructions, episodes.vocabulary)
+        model = Mage(replace(config, vqvae=vqvae.config, text=text))
+    model.vqvae.load_state_dict(vqvae.state_dict())
+    model.vqvae.requires_grad_(False).eval()
     return model
 
 
-def next_imagined(args: MageTraining, step: int, frames: int, rng: np.random.Generator) -> int:
+def cached_codes(
+    model: VQVAE, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1, *, batch: int = 2
+) -> FrameCache:
+    """The codes (h, w) uint16 of every frame; those that are not in `folder` yet are computed and written there.
+
+    Args:
+        process: which share of the work is this process's.
+        processes: how many share it.
+        batch: episodes at once.
+
+    Raises:
+        CacheError: if `folder` is damaged, or holds the codes of another VQ-VAE or of other episodes.
+    """
+
+    @torch.no_grad()
+    def compute(chosen: range) -> NDArray[np.uint16]:
+        found = []
+        for first in range(chosen.start, chosen.stop, batch):
+            numbers = range(first, min(first + batch, chosen.stop))
+            frames_NHW3 = np.concatenate([episodes.frames(number) for number in numbers])
+            found.append(model.encode(to_frames(frames_NHW3[None], model.device)[0]))
+        return torch.cat(found).cpu().numpy().astype(np.uint16)
+
+    network = weights_fingerprint(model, model.config.encoder_fingerprint)
+    return FrameCache(folder, episodes, network).fill(compute, process, processes)
+
+
+def schedule(args: MageTraining, step: int, frames: int, rng: np.random.Generator) -> int:
     """How many of the frames that update number `step` learns from are imagined; grows to all but the first."""
     begin = round(args.steps * (1 - args.autoregressive))
     if step < begin:
@@ -159,11 +217,36 @@ def next_imagined(args: MageTraining, step: int, frames: int, rng: np.random.Gen
     return int(rng.integers(0, max(1, round(grown * (frames - 2))) + 1))
 
 
-def draw(
-    args: MageTraining, cache: CodeCache, frames: int, rng: np.random.Generator, rows: slice
-) -> tuple[Tensor, int, Tensor]:
-    """These rows of a step's batch: codes (B, T, h, w), the stride between their frames, the episodes' numbers (B)."""
-    stride = int(rng.integers(1, args.stride + 1))
-    chosen_B = rng.integers(len(cache), size=args.batch)[rows]
-    codes_BThw = cache.clips(chosen_B, stride * np.arange(frames))
-    return codes_BThw, stride, torch.from_numpy(chosen_B)
+@torch.no_grad()
+def measure(model: Mage, episodes: Episodes, chosen: Iterable[int], batch: int = 8) -> PredictionMetrics:
+    """Metrics of some episodes; frames after an episode's end are its last."""
+    numbers = list(chosen)
+    ratios: dict[str, list[Tensor]] = {"psnr": [], "still_psnr": [], "redrawn_psnr": []}
+    right, changed_right, changed_all = [], 0, 0
+    times_T = np.arange(model.config.axial.frames)
+    for first in range(0, len(numbers), batch):
+        part = numbers[first : first + batch]
+        clips = [clip[np.minimum(times_T, len(clip) - 1)] for clip in map(episodes.frames, part)]
+        frames_BT3HW = to_frames(np.stack(clips), model.device)
+        B, T = frames_BT3HW.shape[:2]
+        true_BThw = model.vqvae.encode(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
+        with evaluating(model):
+            text = model.text([episodes.instructions[number] for number in part])
+            imagined_BShw = model.axial.imagine(true_BThw[:, :1], text, T - 1)
+        real = (frames_BT3HW[:, 1:] + 1) / 2
+        for name, codes in (
+            ("psnr", imagined_BShw),
+            ("still_psnr", true_BThw[:, :1].expand_as(imagined_BShw)),
+            ("redrawn_psnr", true_BThw[:, 1:]),
+        ):
+            drawn = model.vqvae.decode(codes.flatten(0, 1)).unflatten(0, (B, T - 1))
+            ratios[name].append(psnr((drawn.clamp(-1, 1) + 1) / 2, real))
+        hits, changed = imagined_BShw == true_BThw[:, 1:], true_BThw[:, 1:] != true_BThw[:, :1]
+        right.append(hits.float().mean(dim=(1, 2, 3)))
+        changed_right += int((hits & changed).sum())
+        changed_all += int(changed.sum())
+    return PredictionMetrics(
+        **{name: float(torch.cat(values).mean()) for name, values in ratios.items()},
+        codes=float(torch.cat(right).mean()),
+        changed_codes=changed_right / max(1, changed_all),
+    )

@@ -7,17 +7,68 @@ Shape suffixes: N frames, H and W pixels, h and w codes along a side, C width of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from math import exp, log2
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.baselines.mage.config import VQVAEConfig
+from textocvp.checkpoint import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    CheckpointError,
+    load_weights,
+    read_json,
+    write_checkpoint,
+)
+from textocvp.config import build
 from textocvp.layers import full_precision
 from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
 from textocvp.renderers.image_decoders import build_image_decoder
+
+VQVAE_ARCHITECTURE = "mage-vqvae"
+M = TypeVar("M", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class VQVAEConfig:
+    """From a frame to a square of codes and back.
+
+    Attributes:
+        image_size: side of the square frame in pixels.
+        encoder: `conv` (MAGE) or `dinov2` (MAGE-DINO: its features, frozen, become codes, and the decoder of
+            TextOCVP-DINO draws them).
+        ratio: pixels along the side of a code's square; a power of two (`conv` only).
+        channels: width of the convolutions; with `dinov2` of the decoder's first, a multiple of 32.
+        blocks: residual blocks of the encoder, and of the decoder (`conv` only).
+        codebook_size: how many codes there are.
+        code_dim: numbers a code.
+        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
+        encoder_dim: width of its features.
+        encoder_patch: side of its patches in pixels.
+        encoder_fingerprint: of its weights, set when they are first used; other weights are then an error.
+    """
+
+    image_size: int = 64
+    encoder: Literal["conv", "dinov2"] = "conv"
+    ratio: int = 4
+    channels: int = 256
+    blocks: int = 2
+    codebook_size: int = 512
+    code_dim: int = 256
+    encoder_weights: str = ""
+    encoder_dim: int = 768
+    encoder_patch: int = 14
+    encoder_fingerprint: str = ""
+
+    @property
+    def grid(self) -> int:
+        """Codes along a side of a frame."""
+        return self.image_size // (self.ratio if self.encoder == "conv" else self.encoder_patch)
 
 
 @dataclass
@@ -177,11 +228,14 @@ class VQVAE(nn.Module):
     @property
     def config(self) -> VQVAEConfig:
         """What it was built from; once they are known, with the fingerprint of the frozen encoder's weights."""
-        return (
-            self._config
-            if self.dino is None
-            else replace(self._config, encoder_fingerprint=self.dino.fingerprint)
-        )
+        if self.dino is None:
+            return self._config
+        return replace(self._config, encoder_fingerprint=self.dino.fingerprint)
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters are."""
+        return self.codebook.codes_KC.device
 
     @property
     def dino(self) -> DinoEncoder | None:
@@ -189,13 +243,13 @@ class VQVAE(nn.Module):
         return self.encoder.dino if isinstance(self.encoder, DinoCodes) else None
 
     def features(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> Tensor:
-        """What the encoder says of frames in -1..1, (N, h, w, C).
+        """The encoder's features (N, h, w, C) of frames in -1..1.
 
         Args:
             features_NLF: of the frozen encoder, where they are known already.
 
         Raises:
-            DinoWeightsError: if the weights of the frozen encoder are missing.
+            WeightsError: if the weights of the frozen encoder are missing.
         """
         known = () if features_NLF is None else (features_NLF,)
         return self.encoder(frames_N3HW, *known).permute(0, 2, 3, 1)
@@ -213,7 +267,7 @@ class VQVAE(nn.Module):
         return self.decoder(vectors_NhwC.permute(0, 3, 1, 2)).float()
 
     def forward(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> tuple[Tensor, Quantized]:
-        """The frames (N, 3, H, W) redrawn from their codes, and what was found on the way. Arguments as `features`."""
+        """The frames (N, 3, H, W) redrawn from their codes, and the codes. Arguments as `features`."""
         found = self.codebook(self.features(frames_N3HW, features_NLF))
         return self.draw(found.vectors_NhwC), found
 
@@ -222,3 +276,45 @@ def perplexity(counts_K: Tensor) -> float:
     """How many codes are used, effectively: the exponential of the entropy of their frequencies (K)."""
     share_K = counts_K[counts_K > 0].double() / counts_K.sum()
     return exp(-float((share_K * share_K.log()).sum()))
+
+
+def save_vqvae(model: VQVAE, folder: Path) -> None:
+    """Write a checkpoint of a VQ-VAE alone, on which the transformer is then trained."""
+    config = {"architecture": VQVAE_ARCHITECTURE, "vqvae": asdict(model.config)}
+    write_checkpoint(folder, model, config)
+
+
+def load_vqvae(folder: Path) -> VQVAE:
+    """The VQ-VAE of a checkpoint, in evaluation mode.
+
+    Raises:
+        CheckpointError: as `read_checkpoint`.
+    """
+    return read_checkpoint(
+        folder,
+        VQVAE_ARCHITECTURE,
+        lambda data: VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "vqvae")),
+    )
+
+
+def read_checkpoint(folder: Path, architecture: str, build_model: Callable[[dict[str, Any]], M]) -> M:
+    """The model of a checkpoint, in evaluation mode.
+
+    Args:
+        architecture: what `config.json` must say.
+        build_model: makes the model from what it says.
+
+    Raises:
+        CheckpointError: if a file is missing or damaged, it is of another architecture, or a config field or tensor
+            does not fit; it is named.
+    """
+    data = read_json(folder)
+    found = data.get("architecture", "textocvp")
+    if found != architecture:
+        raise CheckpointError(f"{folder} holds a {found!r} model, and this needs one of {architecture!r}")
+    try:
+        model = build_model(data)
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
+    load_weights(model, folder / WEIGHTS_FILE)
+    return model.eval()

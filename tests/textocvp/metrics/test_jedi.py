@@ -19,6 +19,12 @@ TINY = VJEPA2Config(
 )  # fmt: skip
 
 
+def distance_of_means(x: np.ndarray, y: np.ndarray) -> float:
+    """(x . y / D)^2 is the inner product of all products of two coordinates, so the value is a distance of means."""
+    means = [z.T @ z / len(z) / z.shape[1] for z in (x, y)]
+    return 100 * ((means[0] - means[1]) ** 2).sum()
+
+
 def test_discrepancy_by_hand() -> None:
     # D = 2. Own pairs of x: k(a, a) = (1 / 2)^2, k(b, b) = (4 / 2)^2, k(a, b) = 0: mean 17 / 16. y is one point with
     # k = (2 / 2)^2 = 1. Between: (1 / 2)^2 and (2 / 2)^2: mean 5 / 8. Together 17 / 16 + 1 - 5 / 4 = 13 / 16.
@@ -27,19 +33,13 @@ def test_discrepancy_by_hand() -> None:
 
 
 def test_discrepancy_agrees_with_the_features_that_the_kernel_stands_for() -> None:
-    """(x . y / D)^2 is the inner product of all products of two coordinates, so the figure is a distance of means."""
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(9, 5)), rng.normal(0.3, 1.2, size=(7, 5))
-
-    def mean_of_products(z: np.ndarray) -> np.ndarray:
-        return np.array([[(z[:, i] * z[:, j]).mean() / 5 for j in range(5)] for i in range(5)])
-
-    expected = 100 * ((mean_of_products(x) - mean_of_products(y)) ** 2).sum()
-    assert polynomial_mmd(x, y) == pytest.approx(expected)
-    assert polynomial_mmd(y, x) == pytest.approx(expected)
+    assert polynomial_mmd(x, y) == pytest.approx(distance_of_means(x, y))
+    assert polynomial_mmd(y, x) == pytest.approx(distance_of_means(x, y))
 
 
-def test_equal_sets_in_any_order_are_at_0_and_no_interval_leaves_its_figure() -> None:
+def test_equal_sets_in_any_order_are_at_0_and_no_interval_leaves_its_value() -> None:
     rng = np.random.default_rng(1)
     x = rng.normal(size=(20, 6))
     assert polynomial_mmd(x, x[::-1]) == pytest.approx(0, abs=1e-9)
@@ -52,10 +52,10 @@ def test_equal_sets_in_any_order_are_at_0_and_no_interval_leaves_its_figure() ->
 
 
 def test_the_interval_holds_the_truth_about_as_often_as_it_says() -> None:
-    """Films that differ by a shift: the truth is the figure of very many of them."""
+    """Videos that differ by a shift: the truth is the value of very many of them."""
     many = np.random.default_rng(2).normal(size=(4000, 3))
     shift = np.array([1.0, 0.5, 0.0])
-    truth = polynomial_mmd(many + shift, many)
+    truth = distance_of_means(many + shift, many)
     inside = 0
     for trial in range(100):
         x = np.random.default_rng(100 + trial).normal(size=(60, 3))
@@ -70,8 +70,8 @@ def test_features_that_do_not_fit_are_refused(shapes: tuple[tuple[int, ...], tup
         polynomial_mmd(np.ones(shapes[0]), np.ones(shapes[1]))
 
 
-def test_films_without_a_partner_are_refused() -> None:
-    with pytest.raises(ValueError, match="a real film for each"):
+def test_videos_without_a_partner_are_refused() -> None:
+    with pytest.raises(ValueError, match="a real video for each"):
         jedi(np.ones((3, 4)), np.ones((4, 4)))
 
 
@@ -79,10 +79,10 @@ def test_features_are_those_of_the_attentive_probe(tmp_path: Path) -> None:
     torch.manual_seed(0)
     model = VJEPA2ForVideoClassification(TINY).eval()
     model.save_pretrained(tmp_path)
-    films = torch.rand(2, 4, 3, 16, 16)
-    found = load_vjepa(tmp_path)(films)
+    videos = torch.rand(2, 4, 3, 16, 16)
+    found = load_vjepa(tmp_path)(videos)
     mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-    pixels = (films - mean.view(3, 1, 1)) / deviation.view(3, 1, 1)
+    pixels = (videos - mean.view(3, 1, 1)) / deviation.view(3, 1, 1)
     seen: list[torch.Tensor] = []
     model.classifier.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     model(pixel_values_videos=pixels)
@@ -90,15 +90,15 @@ def test_features_are_those_of_the_attentive_probe(tmp_path: Path) -> None:
     assert torch.allclose(found, seen[0], atol=1e-5)
 
 
-def test_without_a_probe_they_are_the_mean_of_the_tokens_and_films_are_stretched(tmp_path: Path) -> None:
+def test_without_a_probe_they_are_the_mean_of_the_tokens_and_videos_are_stretched(tmp_path: Path) -> None:
     torch.manual_seed(0)
     VJEPA2Model(TINY).save_pretrained(tmp_path)
     features = load_vjepa(tmp_path)
-    film = torch.rand(1, 2, 3, 16, 16)
-    slow = film.repeat_interleave(2, dim=1)  # what stretching two frames to four gives
-    assert features(film).shape == (1, 12)
-    assert torch.equal(features(film), features(slow))
-    assert not torch.allclose(features(film), features(film.flip(1)))
+    video = torch.rand(1, 2, 3, 16, 16)
+    slow = video.repeat_interleave(2, dim=1)  # what stretching two frames to four gives
+    assert features(video).shape == (1, 12)
+    assert torch.equal(features(video), features(slow))
+    assert not torch.allclose(features(video), features(video.flip(1)))
 
 
 def test_without_weights_the_reason_says_what_to_fetch(tmp_path: Path) -> None:

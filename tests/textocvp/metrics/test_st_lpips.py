@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from textocvp.metrics.perceptual import WeightsNotFound, load_shift_tolerant, load_st_lpips, weights_file
+from textocvp.metrics import perceptual
+from textocvp.metrics.perceptual import MetricUnavailable, load_st_lpips, st_lpips_weights
 
 
 @pytest.fixture
@@ -63,7 +64,7 @@ def test_a_pixels_shift_counts_less_than_another_picture() -> None:
     assert float(distance(shifted, real)) < 0.25 * float(distance(other, real))
 
 
-def test_features_kept_of_the_real_film_give_the_same_distances() -> None:
+def test_features_kept_of_the_real_video_give_the_same_distances() -> None:
     real, imagined = pictures(2, 5, 3, 32, 32)
     distance = load_st_lpips()
     kept = distance.features(real)
@@ -78,17 +79,16 @@ def test_small_pictures_are_refused() -> None:
 
 
 def test_other_weights_are_refused(tmp_path: Path) -> None:
-    stored = torch.load(weights_file(), map_location="cpu", weights_only=True)
+    stored = torch.load(st_lpips_weights(), map_location="cpu", weights_only=True)
     del stored["lin3.model.1.weight"]
     torch.save(stored, tmp_path / "a.pth")
-    with pytest.raises(WeightsNotFound, match=r"has not the weights .*lin3\.model\.1\.weight"):
-        load_shift_tolerant(tmp_path / "a.pth")
+    with pytest.raises(MetricUnavailable, match=r"has not the weights .*lin3\.model\.1\.weight"):
+        load_st_lpips(tmp_path / "a.pth")
 
 
 def test_without_the_package_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    from textocvp.metrics import perceptual as shift_tolerant
-    from textocvp.metrics.perceptual import MetricUnavailable
-
-    monkeypatch.setattr(shift_tolerant, "find_spec", lambda name: None)
-    with pytest.raises(MetricUnavailable, match="pip install stlpips_pytorch"):
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
+    with pytest.raises(
+        MetricUnavailable, match=r"ST-LPIPS cannot be computed: .*pip install stlpips_pytorch"
+    ):
         load_st_lpips()

@@ -13,7 +13,7 @@ from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel
 from textocvp.config import ModelConfig, with_settings
-from textocvp.training.predictor import PredictorTraining, extend_window, train, with_longer_window
+from textocvp.training.predictor import PredictorTraining, extend_window, train
 
 TEXT = "put the red block in the blue bowl"
 
@@ -39,11 +39,13 @@ def test_rollouts_within_the_old_window_stay_as_they_are(kind, encoding, scene: 
 
 
 def test_codes_that_training_never_reached_are_not_copied():
-    predictor = build(PUBLISHED).predictor
-    grown = with_longer_window(predictor, 7)
-    assert grown.ages.shape[0] == 8 and predictor.ages.shape[0] == 5
-    assert torch.equal(grown.ages[:4], predictor.ages[:4])
-    assert (grown.ages[4:] == predictor.ages[3]).all()  # predictor.ages[4] is the age that no window of 4 has
+    model = build(PUBLISHED)
+    before = model.predictor.ages
+    extend_window(model, ["predictor.window=7"])
+    after = model.predictor.ages
+    assert after.shape[0] == 8 and before.shape[0] == 5
+    assert torch.equal(after[:4], before[:4])
+    assert (after[4:] == before[3]).all()  # before[4] is the age that no window of 4 has
 
 
 def test_other_changes_and_shorter_windows_are_refused():

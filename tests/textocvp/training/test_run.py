@@ -13,55 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.textocvp import both_stages
-from tests.textocvp.conftest import PLACED, PUBLISHED
+from tests.textocvp.training import both_stages
+from tests.textocvp.training.runs import losses, parser_run, predictor_run, same_weights, train, weights
 from textocvp import cli
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.prefetch import prefetch
-from textocvp.presets import PRESETS
-from textocvp.training import parser as train_parser
-from textocvp.training import predictor as train_predictor
-from textocvp.training import run as training
-from textocvp.training.parser import ClipReader, ParserTraining
-from textocvp.training.predictor import PredictorTraining
+from textocvp.training.clips import ClipReader
 from textocvp.training.run import Run, SettingsError
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Toy episodes and a checkpoint of each family; the tiny presets are known by name."""
-    both_stages.write_inputs(tmp_path)
-    for config in (PLACED, PUBLISHED):
-        monkeypatch.setitem(PRESETS, config.name, config)
-    return tmp_path
-
-
-def parser_run(folder: Path, out: str, **changes) -> ParserTraining:
-    settings = dict(preset=PUBLISHED.name, steps=3, batch=5, clip=2, warmup=1) | changes
-    return ParserTraining(folder / "train.h5", folder / "val.h5", folder / out, **settings)
-
-
-def predictor_run(folder: Path, out: str, **changes) -> PredictorTraining:
-    settings = dict(parser=folder / PLACED.name, steps=3, batch=5, warmup=1, horizon=2, image_weight=1.0)
-    return PredictorTraining(folder / "train.h5", folder / "val.h5", folder / out, **(settings | changes))
-
-
-def train(args: ParserTraining | PredictorTraining) -> None:
-    (train_parser if isinstance(args, ParserTraining) else train_predictor).train(args)  # type: ignore[arg-type]
-
-
-def weights(out: Path) -> dict[str, torch.Tensor]:
-    return load_file(out / "checkpoint" / "model.safetensors")
-
-
-def losses(out: Path) -> list[float]:
-    """What every step's loss was, as the log has it."""
-    log = EventAccumulator(str(out / "logs" / "training"))
-    log.Reload()
-    return [scalar.value for scalar in log.Scalars("loss/total")]
+def drawing_run(folder: Path, out: str, **changes):
+    return predictor_run(folder, out, image_weight=1.0, **changes)
 
 
 def assert_same_run(one: Path, other: Path, *, exactly: bool = False) -> None:
@@ -77,7 +40,7 @@ def assert_same_run(one: Path, other: Path, *, exactly: bool = False) -> None:
 def test_two_processes_are_the_same_run_as_one(folder: Path) -> None:
     """The command that people use, started twice by torchrun, meeting over gloo."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    command = [*launcher, "-m", "tests.textocvp.both_stages", str(folder), "two"]
+    command = [*launcher, "-m", "tests.textocvp.training.both_stages", str(folder), "two"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -92,17 +55,15 @@ def test_two_processes_are_the_same_run_as_one(folder: Path) -> None:
         assert_same_run(one, two)
 
 
-@pytest.mark.parametrize("make", [parser_run, predictor_run])
-def test_parts_of_a_batch_add_up_to_it(folder: Path, monkeypatch: pytest.MonkeyPatch, make) -> None:
-    monkeypatch.setattr(training, "LOG_EVERY", 1)
+@pytest.mark.parametrize("make", [parser_run, drawing_run])
+def test_micro_batches_add_up_to_the_batch(folder: Path, make) -> None:
     whole, parts = make(folder, "whole"), make(folder, "parts", accumulate=3)  # of 1, 2 and 2 rows
     train(whole)
     train(parts)
     assert_same_run(whole.out, parts.out)
 
 
-def test_workers_change_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "LOG_EVERY", 1)
+def test_workers_change_nothing(folder: Path) -> None:
     alone, helped = parser_run(folder, "alone"), parser_run(folder, "helped", workers=2)
     train(alone)
     train(helped)
@@ -146,19 +107,18 @@ def test_shares_of_the_clips_are_the_clips(folder: Path) -> None:
     assert torch.equal(torch.cat([share.seeds_B for share in shares]), whole.seeds_B)
 
 
-@pytest.mark.parametrize("make", [parser_run, predictor_run])
+@pytest.mark.parametrize("make", [parser_run, drawing_run])
 def test_a_terminated_run_saves_itself_and_continues_exactly(
     folder: Path, monkeypatch: pytest.MonkeyPatch, make
 ) -> None:
     """SIGTERM is what a cluster sends before it takes a machine away."""
-    monkeypatch.setattr(training, "LOG_EVERY", 1)
     straight, resumed = (make(folder, name, accumulate=2, steps=4) for name in ("straight", "resumed"))
     train(straight)
 
     update = Run.update
 
-    def asked_to_end(self, step, figures=None):
-        update(self, step, figures)
+    def asked_to_end(self, step, metrics=None):
+        update(self, step, metrics)
         if step == 1:
             os.kill(os.getpid(), signal.SIGTERM)
 
@@ -174,13 +134,11 @@ def test_a_terminated_run_saves_itself_and_continues_exactly(
     torch.rand(7)  # the world goes on
     train(resumed)
     assert steps == [2, 3]
-    a, b = weights(straight.out), weights(resumed.out)
-    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert same_weights(straight.out, resumed.out)
 
 
-def test_brain_floats_are_close_to_floats(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "LOG_EVERY", 1)
-    for make in (parser_run, predictor_run):
+def test_brain_floats_are_close_to_floats(folder: Path) -> None:
+    for make in (parser_run, drawing_run):
         plain, mixed = make(folder, make.__name__), make(folder, make.__name__ + "-bf16", precision="bf16")
         train(plain)
         train(mixed)
@@ -189,7 +147,7 @@ def test_brain_floats_are_close_to_floats(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_what_cannot_be_done_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    with pytest.raises(SettingsError, match=r"batch of 5 .* 1 processes x 6 parts"):
+    with pytest.raises(SettingsError, match=r"batch of 5 .* 1 processes x 6 micro-batches"):
         train(parser_run(folder, "out", accumulate=6))
     with pytest.raises(SettingsError, match="accumulate must be at least 1"):
         train(replace(parser_run(folder, "out"), accumulate=0))

@@ -1,6 +1,6 @@
 """Every stage of training on toy episodes, for tests that compare one process with several.
 
-torchrun --standalone --nproc_per_node 2 -m tests.textocvp.both_stages FOLDER NAME
+torchrun --standalone --nproc_per_node 2 -m tests.textocvp.training.both_stages FOLDER NAME
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from unittest.mock import patch
 from tests.textocvp.conftest import PLACED, PUBLISHED, SMALL_TEXT, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
-from textocvp.baselines.mage.config import MAGE_PRESETS, AxialConfig, MageConfig, VQVAEConfig
+from textocvp.baselines.mage import MAGE_PRESETS, MageConfig
+from textocvp.baselines.mage.axial import AxialConfig
+from textocvp.baselines.mage.vqvae import VQVAEConfig
 from textocvp.presets import PRESETS
 from textocvp.training import run as training
 

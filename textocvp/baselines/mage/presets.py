@@ -1,0 +1,41 @@
+"""The named sizes of MAGE.
+
+Those of the published model are from "Make It Move" (CVPR 2022), section 4 and the configuration published with it,
+and from TextOCVP (TMLR 2026), appendix.
+"""
+
+from __future__ import annotations
+
+from textocvp.baselines.mage.axial import AxialConfig
+from textocvp.baselines.mage.model import MageConfig
+from textocvp.baselines.mage.vqvae import VQVAEConfig
+from textocvp.text.words import WordsConfig
+
+MAGE_PRESETS: dict[str, MageConfig] = {
+    # The published sizes at 64x64.
+    "mage": MageConfig(name="mage"),
+    # For two CPU cores: VQ-VAE in minutes, the transformer in tens of minutes, at the episodes' 25 frames. Without
+    # `copy` most of that time goes into learning that the table does not move.
+    "mage-small": MageConfig(
+        name="mage-small",
+        vqvae=VQVAEConfig(channels=64, code_dim=64),
+        text=WordsConfig(kind="lexicon"),
+        axial=AxialConfig(dim=128, heads=4, hidden=256, frames=25, patch=2, copy=True),
+    ),
+    # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).
+    "mage-dino": MageConfig(
+        name="mage-dino", vqvae=VQVAEConfig(image_size=336, encoder="dinov2", channels=1024)
+    ),
+}
+
+
+def mage_preset(name: str) -> MageConfig:
+    """The preset of that name.
+
+    Raises:
+        KeyError: if there is none; the message lists those that exist.
+    """
+    try:
+        return MAGE_PRESETS[name]
+    except KeyError:
+        raise KeyError(f"unknown MAGE preset {name!r}; known: {', '.join(sorted(MAGE_PRESETS))}") from None
