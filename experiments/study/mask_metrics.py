@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from textocvp import Rollout
-from textocvp.metrics.masks import FIRST_OBJECT, foreground_ari, object_ious, overlaps, slot_labels
+from textocvp.metrics import foreground_ari, object_ious, overlaps, slot_labels
 
-ARM = 1  # its label in a segmentation
+BACKGROUND, ARM = 0, 1  # their labels in a segmentation
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,14 @@ def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> Ma
     """
     if labels_THW.shape != truth_THW.shape:
         raise ValueError(f"labels are {labels_THW.shape}, the segmentation {truth_THW.shape}")
-    first = object_ious(labels_THW[0], _arm_as_object(truth_THW[0]))
-    held = dict(zip((first.ids - 1).tolist(), first.slots.tolist(), strict=True))
+    things = [int(label) for label in np.unique(truth_THW) if label != BACKGROUND]
+    first = object_ious(labels_THW[0], truth_THW[0], things)
+    held = dict(zip(first.ids.tolist(), first.slots.tolist(), strict=True))
     columns = []
     for labels, truth in zip(labels_THW, truth_THW, strict=True):
-        objects = object_ious(labels, truth)
-        things = object_ious(labels, _arm_as_object(truth))
-        of = dict(zip((things.ids - 1).tolist(), things.ious.tolist(), strict=True))
+        objects = object_ious(labels, truth, [label for label in things if label != ARM])
+        matched = object_ious(labels, truth, things)
+        of = dict(zip(matched.ids.tolist(), matched.ious.tolist(), strict=True))
         block, arm = of.get(moved, np.nan), of.get(ARM, np.nan)
         kept = _held_ious(labels, truth, held)
         columns.append(
@@ -61,7 +62,7 @@ def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> Ma
                 block,
                 arm,
                 _mean(objects.ious[objects.ids != moved]),
-                _mean([iou for i, iou in kept.items() if i >= FIRST_OBJECT]),
+                _mean([iou for i, iou in kept.items() if i != ARM]),
                 _mean([kept.get(moved, np.nan), kept.get(ARM, np.nan)]),
                 foreground_ari(labels, truth),
             )
@@ -69,19 +70,13 @@ def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> Ma
     return MaskScores(*np.array(columns, dtype=np.float64).T)
 
 
-def _arm_as_object(truth: np.ndarray) -> np.ndarray:
-    """Every label but the background's one up, so that the metrics take the arm for the first object."""
-    return np.where(truth > 0, truth.astype(np.int64) + 1, 0)
-
-
 def _held_ious(labels: np.ndarray, truth: np.ndarray, held: Mapping[int, int]) -> dict[int, float]:
     """Overlap of each thing that is seen with the slot it has been given; 0 if that slot shows nothing."""
-    ious, slots, ids = overlaps(labels, _arm_as_object(truth))
+    ious, slots, ids = overlaps(labels, truth, list(held))
     found = {}
-    for column, i in enumerate((ids - 1).tolist()):
-        if i in held:
-            row = np.flatnonzero(slots == held[i])
-            found[i] = float(ious[row[0], column]) if len(row) else 0.0
+    for column, i in enumerate(ids.tolist()):
+        row = np.flatnonzero(slots == held[i])
+        found[i] = float(ious[row[0], column]) if len(row) else 0.0
     return found
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from envs import parse_instruction
+from planning import Goal
 from experiments.controllability import LOOP_PLACES
 from experiments.study.scenes import play_expert, sample_scene, study_scenes
 
@@ -39,10 +39,10 @@ def test_an_unknown_split_is_named() -> None:
 
 def test_variants_name_the_other_bowls(env, scene) -> None:
     sampled = sample_scene(env, scene, variants=3)
-    pairs = [parse_instruction(text)[0] for text in sampled.texts]
+    pairs = [Goal.parse(text).instructions[0] for text in sampled.texts]
     bowls = {item["color"] for item in sampled.info["objects"] if item["kind"] == "bowl"}
-    assert {pair.block for pair in pairs} == {pairs[0].block}
-    assert len({pair.bowl for pair in pairs}) == 4 and {pair.bowl for pair in pairs} <= bowls
+    assert {pair.thing.color for pair in pairs} == {pairs[0].thing.color}
+    assert len({pair.target.color for pair in pairs}) == 4 and {pair.target.color for pair in pairs} <= bowls
     assert sample_scene(env, scene, variants=3).texts == sampled.texts
     with pytest.raises(ValueError, match="other bowls, not 9"):
         sample_scene(env, scene, variants=9)
@@ -66,5 +66,5 @@ def test_the_expert_plays_a_variant(env, scene) -> None:
 def test_long_goals_have_as_many_pairs() -> None:
     (scene,) = study_scenes("three_steps", 1, 0)
     env = scene.make()
-    assert len(parse_instruction(sample_scene(env, scene).texts[0])) == 3
+    assert len(Goal.parse(sample_scene(env, scene).texts[0]).instructions) == 3
     env.close()

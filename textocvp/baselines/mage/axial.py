@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
 from textocvp.layers import KeyValueCache
-from textocvp.predictors.base import mask_bias
+from textocvp.layers import mask_bias
 from textocvp.text.base import TextTokens
 
 Axis = Literal["time", "height", "width"]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
-from textocvp.predictors.base import mask_bias
+from textocvp.layers import mask_bias
 from textocvp.text import ENCODERS
 from textocvp.text.base import TextEncoder, TextTokens, WordBatch
 from textocvp.text.words import GRAMMAR, PAD, TRAIN_COLORS, UNKNOWN, WordEncoder, WordsConfig
