@@ -10,7 +10,7 @@ import torch
 
 from tests.textocvp.conftest import PLACED, build
 from textocvp import WorldModel
-from textocvp.baselines.mage.video import MageVideoModel
+from textocvp.baselines.mage import MageVideoModel
 from textocvp.protocols import LoadCheckpoint, LoadModel, LoadWorldModel, SlotModel, load_model
 
 TEXT = "put the red block in the blue bowl"
