@@ -116,7 +116,7 @@ def train_both(folder: Path, data: Path, *settings: str, preset: str = "tabletop
     stage2 = dict(
         parser=str(folder / "parser" / "checkpoint"),
         horizon=2,
-        set=[c for c in changes if c.startswith(("predictor.", "text."))],
+        set=later,
     )
     predictor.train(predictor.PredictorTraining(out=folder / "predictor", **stage2, **common))
     return WorldModel.from_pretrained(folder / "predictor" / "checkpoint")
