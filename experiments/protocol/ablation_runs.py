@@ -132,8 +132,8 @@ def run_named(name: str) -> AblationRun:
     raise KeyError(f"unknown run {name!r}; known: {', '.join(run.name for run in RUNS)}")
 
 
-# Part of the configuration that tells where weights were found, not what the model is.
-WHERE_FROM = {"text.weights", "text.fingerprint"}
+# What depends on the machine and the training file, not on the run: where weights were found, and the words.
+WHERE_FROM = {"text.weights", "text.fingerprint", "text.vocabulary", "text.untrained"}
 PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}
 
 
