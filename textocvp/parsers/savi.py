@@ -76,16 +76,10 @@ class ConvEncoder(nn.Module):
 
     def __init__(self, channels: int, stride: int, out_dim: int) -> None:
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(3, channels, 5, stride=stride, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-        )
+        blocks = [nn.Conv2d(3, channels, 5, stride=stride, padding=2), nn.ReLU()]
+        for _ in range(3):
+            blocks += [nn.Conv2d(channels, channels, 5, padding=2), nn.ReLU()]
+        self.convolutions = nn.Sequential(*blocks)
         init_relu_(self.convolutions)  # else the picture shrinks until the position code drowns it
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
@@ -255,14 +249,8 @@ class SaviParser(SceneParser):
             self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
-        self.transition = nn.TransformerEncoderLayer(
-            dim,
-            config.transition_heads,
-            config.transition_hidden,
-            dropout=0.0,
-            batch_first=True,
-            norm_first=True,
-        )
+        sizes = (dim, config.transition_heads, config.transition_hidden)
+        self.transition = nn.TransformerEncoderLayer(*sizes, dropout=0.0, batch_first=True, norm_first=True)
 
     def forward(
         self,
