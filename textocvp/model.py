@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from huggingface_hub import PyTorchModelHubMixin
@@ -79,27 +80,22 @@ class TextOCVP(
     @classmethod
     def from_pretrained(  # type: ignore[override]
         cls,
-        pretrained_model_name_or_path: str | Path,
+        name: str | Path,
         *,
-        revision: str | None = None,
-        cache_dir: str | Path | None = None,
-        local_files_only: bool = False,
-        token: str | bool | None = None,
         device: str | torch.device = "cpu",
+        **hub: Any,
     ) -> TextOCVP:
         """Load a checkpoint, in evaluation mode.
 
         Args:
-            pretrained_model_name_or_path: as in `resolve_checkpoint`: a bundled name, a folder or a hub id.
-            revision, cache_dir, local_files_only, token: as in `huggingface_hub.snapshot_download`; hub only.
+            name: as in `resolve_checkpoint`: a bundled name, a folder or a hub id.
             device: where to put the model.
+            hub: as in `huggingface_hub.snapshot_download`, for example `revision`.
 
         Raises:
-            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is
-                named.
+            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is named.
         """
-        hub = dict(revision=revision, cache_dir=cache_dir, local_files_only=local_files_only, token=token)
-        with resolve_checkpoint(pretrained_model_name_or_path, **hub) as folder:
+        with resolve_checkpoint(name, **hub) as folder:
             config = read_config(folder)
             try:
                 model = cls(config, folder / TEXT_FOLDER)

@@ -10,7 +10,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,7 +28,7 @@ class WeightsError(ValueError):
 
 @dataclass(frozen=True)
 class PretrainedFiles:
-    """The files of a pretrained encoder, and the words in which messages speak of it.
+    """The files of a pretrained encoder, and how messages name them.
 
     Attributes:
         what: the encoder, for example "the image encoder".
@@ -112,14 +111,6 @@ class PretrainedFiles:
                 f"{self.what} reads models of the type {kind.model_type!r}, {path} is of the type {found!r}"
             )
         return kind.from_dict(data)
-
-
-def package_folder(package: str) -> Path | None:
-    """Where an installed Python package lies; None if it is not installed."""
-    found = find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        return None
-    return Path(found.submodule_search_locations[0])
 
 
 def read_model(kind: type[M], folder: Path, **options: Any) -> M:

@@ -28,6 +28,17 @@ def normalized(frames_N3HW: Tensor) -> Tensor:
     return ((frames_N3HW + 1) / 2 - mean) / std
 
 
+def cells_along(side: int, patch: int, part: str = "parser") -> int:
+    """Patches along a side of a frame; `part` of the configuration names the field in the message.
+
+    Raises:
+        ValueError: if patches do not divide it.
+    """
+    if side % patch:
+        raise ValueError(f"{part}.image_size: patches of {patch} pixels do not divide {side} pixels evenly")
+    return side // patch
+
+
 class DinoEncoder(nn.Module):
     """Frames to the features of their patches, without gradient and always in evaluation mode.
 
@@ -60,16 +71,8 @@ class DinoEncoder(nn.Module):
         self._backbone: list[nn.Module] = []  # a list, so that it is not registered
 
     def cells(self, image_size: int) -> int:
-        """Patches along a side of a square frame.
-
-        Raises:
-            ValueError: if patches do not divide it.
-        """
-        if image_size % self.patch:
-            raise ValueError(
-                f"{self.part}.image_size: patches of {self.patch} pixels do not divide {image_size} pixels evenly"
-            )
-        return image_size // self.patch
+        """Patches along a side of a square frame, see `cells_along`."""
+        return cells_along(image_size, self.patch, self.part)
 
     def load(self) -> DinoEncoder:
         """Read the weights, if that has not been done; returns itself.

@@ -162,14 +162,8 @@ class PlacedTransition(nn.Module):
         content = config.layout.content
         width = 2 * content
         self.inputs = nn.Linear(content + 5, width)
-        self.block = nn.TransformerEncoderLayer(
-            width,
-            config.transition_heads,
-            config.transition_hidden,
-            dropout=0.0,
-            batch_first=True,
-            norm_first=True,
-        )
+        sizes = (width, config.transition_heads, config.transition_hidden)
+        self.block = nn.TransformerEncoderLayer(*sizes, dropout=0.0, batch_first=True, norm_first=True)
         self.outputs = nn.Linear(width, content + 4)
         nn.init.zeros_(self.outputs.weight)
         nn.init.zeros_(self.outputs.bias)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from textocvp.layers import PositionCode, init_relu_
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
-from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
+from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder, cells_along
 from textocvp.slots import SlotLayout
 
 
@@ -55,17 +55,13 @@ class SaviConfig(ParserConfig):
     def __post_init__(self) -> None:
         self._check_layout(explicit=False)
         self._check_heads(self.layout.dim, self.transition_heads)
-        if self.encoder == "dinov2" and self.image_size % self.encoder_patch:
-            raise ValueError(
-                f"parser.image_size: patches of {self.encoder_patch} pixels do not divide {self.image_size} pixels "
-                "evenly"
-            )
+        _ = self.features  # patches must divide the frame
 
     @property
     def features(self) -> tuple[int, int] | None:
         if self.encoder != "dinov2":
             return None
-        return self.image_size // self.encoder_patch, self.encoder_dim
+        return cells_along(self.image_size, self.encoder_patch), self.encoder_dim
 
 
 class ConvEncoder(nn.Module):
@@ -80,16 +76,10 @@ class ConvEncoder(nn.Module):
 
     def __init__(self, channels: int, stride: int, out_dim: int) -> None:
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(3, channels, 5, stride=stride, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-        )
+        blocks = [nn.Conv2d(3, channels, 5, stride=stride, padding=2), nn.ReLU()]
+        for _ in range(3):
+            blocks += [nn.Conv2d(channels, channels, 5, padding=2), nn.ReLU()]
+        self.convolutions = nn.Sequential(*blocks)
         init_relu_(self.convolutions)  # else the picture shrinks until the position code drowns it
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
@@ -118,6 +108,64 @@ class FeatureProjection(nn.Module):
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
         return self.mlp(features_NFhw.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class GaussianInitializer(nn.Module):
+    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test time."""
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
+
+    def forward(
+        self,
+        batch: int,
+        num_slots: int,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
+        """(batch, num_slots, D) slots."""
+        size, mean = (num_slots, len(self.mean)), self.mean
+        if isinstance(generator, Sequence):
+            drawn = [torch.randn(size, generator=one, device=one.device) for one in generator]
+            noise_BKD = torch.stack(drawn).to(mean)
+        else:
+            noise_BKD = torch.randn(batch, *size, generator=generator, device=mean.device, dtype=mean.dtype)
+        return self.mean + self.log_deviation.exp() * noise_BKD
+
+
+class ClusterSlots(nn.Module):
+    """First slots from clusters: the mean feature of each cluster, through a small MLP.
+
+    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
+    family a slot has no presence that could switch it off.
+
+    Args:
+        slot_dim: D.
+        clusters: finds them in what `forward` is given.
+    """
+
+    def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
+        super().__init__()
+        self.clusters = clusters
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
+        )
+        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+
+    def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
+        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers.
+
+        Args:
+            seen_BCHW: what is divided into clusters: frames, or the features of a frozen encoder.
+            features_BDhw: whose means the slots are made of.
+        """
+        found = self.clusters(seen_BCHW, num_slots)
+        h, w = features_BDhw.shape[-2:]
+        shares_BKL = F.adaptive_avg_pool2d(found.masks, (h, w)).flatten(2)
+        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
+        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
+        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL
 
 
 class SlotAttention(nn.Module):
@@ -201,14 +249,8 @@ class SaviParser(SceneParser):
             self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
-        self.transition = nn.TransformerEncoderLayer(
-            dim,
-            config.transition_heads,
-            config.transition_hidden,
-            dropout=0.0,
-            batch_first=True,
-            norm_first=True,
-        )
+        sizes = (dim, config.transition_heads, config.transition_hidden)
+        self.transition = nn.TransformerEncoderLayer(*sizes, dropout=0.0, batch_first=True, norm_first=True)
 
     def forward(
         self,
@@ -256,70 +298,3 @@ class SaviParser(SceneParser):
             if t + 1 < T:
                 guess_BKD = self.transition(slots_BKD)
         return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1), features_BTLF=features_BTLF)
-
-
-class GaussianInitializer(nn.Module):
-    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test
-    time."""
-
-    def __init__(self, slot_dim: int) -> None:
-        super().__init__()
-        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
-        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
-
-    def forward(
-        self,
-        batch: int,
-        num_slots: int,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Tensor:
-        """(batch, num_slots, D) slots."""
-        if isinstance(generator, Sequence):
-            noise_KD = [
-                torch.randn(num_slots, self.mean.shape[0], generator=g, device=g.device) for g in generator
-            ]
-            return self.mean + self.log_deviation.exp() * torch.stack(noise_KD).to(self.mean)
-        noise_BKD = torch.randn(
-            batch,
-            num_slots,
-            self.mean.shape[0],
-            generator=generator,
-            device=self.mean.device,
-            dtype=self.mean.dtype,
-        )
-        return self.mean + self.log_deviation.exp() * noise_BKD
-
-
-class ClusterSlots(nn.Module):
-    """First slots from clusters: the mean feature of each cluster, through a small MLP.
-
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
-    family a slot has no presence that could switch it off.
-
-    Args:
-        slot_dim: D.
-        clusters: finds them in what `forward` is given.
-    """
-
-    def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
-        super().__init__()
-        self.clusters = clusters
-        self.mlp = nn.Sequential(
-            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
-        )
-        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
-
-    def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
-        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers.
-
-        Args:
-            seen_BCHW: what is divided into clusters: frames, or the features of a frozen encoder.
-            features_BDhw: whose means the slots are made of.
-        """
-        found = self.clusters(seen_BCHW, num_slots)
-        shares_BKL = F.adaptive_avg_pool2d(
-            found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
-        ).flatten(2)
-        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
-        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
-        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL

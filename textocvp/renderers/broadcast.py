@@ -38,17 +38,10 @@ class BroadcastRenderer(Renderer):
         self.image_size = image_size
         slot_dim, channels = layout.dim, config.channels
         self.position = PositionCode(slot_dim)
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(slot_dim, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, 4, 3, padding=1),
-        )
+        blocks: list[nn.Module] = []
+        for inputs in (slot_dim, channels, channels, channels):
+            blocks += [nn.Conv2d(inputs, channels, 5, padding=2), nn.ReLU()]
+        self.convolutions = nn.Sequential(*blocks, nn.Conv2d(channels, 4, 3, padding=1))
 
     def forward(self, slots_BKD: Tensor) -> Rendered:
         B, K, D = slots_BKD.shape

