@@ -98,8 +98,8 @@ def measure_parser(
         found.append((matches > 0.5).mean())
         follows.append(followed(labels, segmentation, objects).mean())
         aris.append(np.mean([foreground_ari(labels[t], segmentation[t]) for t in times]))
-    measured = (
+    miou, share, kept, ari = (
         bootstrap_interval(values) if not np.isnan(values).all() else None
         for values in (ious, found, follows, aris)
     )
-    return ParserMetrics(*measured, bootstrap_interval(psnrs), "" if ious else left_out)  # type: ignore[arg-type]
+    return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs), "" if ious else left_out)

@@ -109,11 +109,7 @@ class Trials:
         slot_of: Mapping[int, int],
         rng: np.random.Generator,
     ) -> None:
-        """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence.
-
-        Args:
-            slot_of: the slot that holds each object, by the object's id; -1 for none.
-        """
+        """Add what a scene allows. `slot_of` is the slot that holds each object, by the object's id; -1 for none."""
         moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
         self.original.append(Trial(episode, played.text, moves, ends_at))
         elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
@@ -128,10 +124,7 @@ class Trials:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out episodes as true slots, padded with their last frame, and what is asked of them.
-
-    Without trials instruction following cannot be measured; then slot errors are.
-    """
+    """Held-out episodes as true slots, padded with their last frame, and what is asked of them, if anything can be."""
 
     slots_ETKD: Tensor
     instructions: tuple[str, ...]
@@ -173,10 +166,8 @@ def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
 
 
 def slot_at(state: SlotState, place_2: Tensor, size_2: Tensor) -> int:
-    """The slot of a frame that is of this place and size; -1 if there is none close enough.
-
-    An object may lie in the middle of another, and only its size tells the two apart.
-    """
+    """The slot of a frame that is of this place and size; -1 if there is none close enough."""
+    # An object may lie in the middle of another, and only its size tells the two apart.
     off_K = (state.position - place_2).norm(dim=-1)
     other_size_K = (state.scale - size_2).norm(dim=-1)
     cost_K = (off_K + other_size_K).masked_fill(~state.is_thing[:, 0] | ~(off_K < MATCHED), math.inf)

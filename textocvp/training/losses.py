@@ -40,13 +40,11 @@ class ParserLoss:
         )
 
 
-def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
-    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things.
-
-    A pixel shows a thing where it differs from its image's median colour by more than `threshold`: no labels needed.
-    """
+def thing_weights(target: Tensor, thing_weight: float) -> Tensor:
+    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things."""
+    # A pixel shows a thing where it differs from its image's median colour: no labels needed.
     median = target.flatten(-2).median(-1).values[..., None, None]
-    thing = (target - median).abs().amax(-3, keepdim=True) > threshold
+    thing = (target - median).abs().amax(-3, keepdim=True) > 0.08
     return 1 + thing_weight * thing.to(target.dtype)
 
 
@@ -64,19 +62,18 @@ def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tenso
 def mask_loss(
     rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None
 ) -> Tensor:
-    """Weighted cross-entropy of the drawn masks against the attention's winners; no gradient enters the attention.
+    """Weighted cross-entropy of the drawn masks against the attention's winners (self-distillation, as in SPOT, 2024).
 
-    The renderer sees only the slots, the attention also the pixels: agreeing with it teaches the renderer where a
-    slot ends long before the image loss alone would, and without labels (self-distillation, as in SPOT, 2024).
-    `weights` and `whole` are as in `image_loss`.
+    No gradient enters the attention. `weights` and `whole` are as in `image_loss`.
     """
+    # The attention sees the pixels, the renderer only the slots: this teaches it early where a slot ends.
     log_masks = rendered.masks_BKHW.clamp_min(1e-6).log()
     per_pixel = F.nll_loss(log_masks, attention_BKHW.argmax(1), reduction="none")
     return (weights[:, 0] * per_pixel).sum() / (weights.sum() if whole is None else whole)
 
 
 def place_loss(expected: SlotState, found: SlotState) -> Tensor:
-    """Mean squared error of expected places and log-sizes, over the things of each clip, then over the clips (B, T, K).
+    """Squared error of expected places and log-sizes, the mean over each clip's things, then over the clips (B, T, K).
 
     No gradient enters `found`.
     """
@@ -88,10 +85,7 @@ def place_loss(expected: SlotState, found: SlotState) -> Tensor:
 
 
 def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Tensor) -> Tensor:
-    """Mean squared error of places and log-sizes against mean and deviation of the grid under the attention.
-
-    No gradient enters the attention.
-    """
+    """Mean squared error of places and log-sizes against those of the attention, which no gradient enters."""
     center_BK2, deviation_BK2 = moments(attention_BKHW.detach())
     return ((position_BK2 - center_BK2).square() + (scale_BK2 / deviation_BK2).log().square()).mean()
 
@@ -152,12 +146,11 @@ def slot_loss(
 def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, ever: bool) -> Tensor:
     """How much each true slot of frames 1 to T - 1 counts (B, T - 1, K): `moving` where it moves, else 1; 0 if unused.
 
-    Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
-
     Args:
         ever: weigh a slot that moves anywhere in these frames alike in all of them. For rollouts, where a
             slot that has come to rest in the wrong place is still wrong.
     """
+    # Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
     if not layout.explicit:
         return slots_BTKD.new_ones(slots_BTKD[:, 1:, :, 0].shape)
     state = SlotState.split(slots_BTKD, layout)

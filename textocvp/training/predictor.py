@@ -70,12 +70,6 @@ class PredictorTraining(TrainingSettings):
     """Weight of the error in size."""
     content_weight: float = 0.3
     """Weight of the error in content."""
-    recolor: bool = True
-    """Permute the colour channels of scene and lexicon together (text kind `lexicon`; no other words follow)."""
-    color_jitter: float = 0.03
-    """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
-    place_jitter: float = 0.01
-    """Standard deviation of the noise on the teacher's slot places, in -1..1."""
     image_weight: float = 0.0
     """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
     image_frames: int = 2
@@ -151,15 +145,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
         accelerator.wait_for_everyone()
         # One frame more than the past, so that every time code gets trained.
         frames = model.config.predictor.window + 1 if causal else int(slots.lengths.max())
-        batches = SlotBatches(
-            slots,
-            layout,
-            model.text,
-            frames,
-            recolor=args.recolor,
-            color_jitter=args.color_jitter,
-            place_jitter=args.place_jitter,
-        )
+        batches = SlotBatches(slots, layout, model.text, frames)
         std_C = model.predictor.content_std_C if model.predictor.standardized else None
         if (
             std_C is not None and not args.finetune
@@ -276,12 +262,13 @@ def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
             f"the window can grow, not shrink: it is {old.window} frames, {new.window} were asked for"
         )
     model.config, predictor.config = config, new
-    rows = new.time_codes
     if new.age_encoding == "learned":
         # The codes of new frames start as the last one that training reached. The published form has one code more
         # than its window has frames: no training ever reached that one.
         reached = predictor.ages.detach()[: old.window]
-        predictor.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(rows - old.window, -1)]))
+        predictor.ages = nn.Parameter(
+            torch.cat([reached, reached[-1:].expand(new.time_codes - old.window, -1)])
+        )
     else:
-        codes = sinusoids(rows, new.dim).to(predictor.ages.device)
+        codes = sinusoids(new.time_codes, new.dim).to(predictor.ages.device)
         predictor.register_buffer("ages", codes, persistent=False)

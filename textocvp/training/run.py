@@ -251,11 +251,6 @@ class Run:
         """Where this process computes."""
         return self.accelerator.device
 
-    @property
-    def is_main(self) -> bool:
-        """Whether this process is the one that measures, draws and writes."""
-        return self.accelerator.is_main_process
-
     def steps(self, name: str) -> Iterator[int]:
         """The numbers of the steps that are left. Saves the state when it is time to, and at the end.
 
@@ -264,9 +259,8 @@ class Run:
         Args:
             name: of the progress bar.
         """
-        total = self.args.steps
-        left, hidden = range(self.first, total), not self.is_main
-        self._bar = tqdm(left, name, initial=self.first, total=total, unit="step", disable=hidden)
+        first, total, hidden = self.first, self.args.steps, not self.accelerator.is_main_process
+        self._bar = tqdm(range(first, total), name, initial=first, total=total, unit="step", disable=hidden)
         saved = time.monotonic()
         with _termination() as asked:
             for step in self._bar:
@@ -283,8 +277,7 @@ class Run:
     def micro_batches(self, *, of_batch: bool = False) -> Iterator[slice]:
         """Parts of this process's rows; each wants one `backward`.
 
-        Args:
-            of_batch: count them from the first row of the whole batch, not from this process's first.
+        They are counted from this process's first row, or with `of_batch` from the first of the whole batch.
         """
         zero = 0 if of_batch else self.rows.start
         for first, end in pairwise(self._edges):
@@ -298,23 +291,14 @@ class Run:
         return (part.stop - part.start) / self.args.batch
 
     def backward(self, loss: Tensor, terms: Mapping[str, Tensor] | None = None) -> None:
-        """Add the gradients of one micro-batch.
-
-        Args:
-            loss: what it adds to the loss of the batch.
-            terms: its terms by name, for the log.
-        """
+        """Add the gradients of what a micro-batch adds to the loss of the batch; `terms` are for the log."""
         # Gradients are averaged over the processes; they are meant to add up.
         self.accelerator.backward(loss * self.accelerator.num_processes)
         for name, value in {"total": loss, **(terms or {})}.items():
             self._sums[f"loss/{name}"] = self._sums.get(f"loss/{name}", 0.0) + value.detach()
 
     def update(self, step: int, metrics: Mapping[str, float] | None = None) -> None:
-        """Take the step that the gradients ask for, and log now and then.
-
-        Args:
-            metrics: more for the log, which all processes agree on.
-        """
+        """Take the step that the gradients ask for, and log now and then, also `metrics`, equal on all processes."""
         norm = self.accelerator.clip_grad_norm_(self.module.parameters(), self.args.clip_norm)
         self._optimizer.step()
         self._schedule.step()
@@ -335,7 +319,7 @@ class Run:
             measure: gives the figures of the first so many held-out episodes, or of all (None).
             draw: writes a picture of a few of them.
         """
-        if not self.is_main or (step + 1) % self.args.evaluate_every:
+        if not self.accelerator.is_main_process or (step + 1) % self.args.evaluate_every:
             return
         metrics = measure(self.args.evaluate_episodes)
         self.accelerator.log(metrics.as_metrics(), step)
@@ -345,7 +329,7 @@ class Run:
 
     def finish(self, save: Callable[[Path], Any], measure: Callable[[int | None], M], file: str) -> M | None:
         """Write `out`/checkpoint, and the figures of all held-out episodes as `out`/`file`; None on other processes."""
-        if not self.is_main:
+        if not self.accelerator.is_main_process:
             return None
         save(self.args.out / "checkpoint")
         metrics = measure(None)
