@@ -127,7 +127,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
                 )
                 run.backward(
                     image + codebook + args.commitment * commitment,
-                    {"loss/image": image, "loss/commitment": commitment},
+                    {"image": image, "commitment": commitment},
                 )
                 counts_K += found.codes_Nhw.flatten().bincount(minlength=len(counts_K))
             counts_K = run.total(counts_K).cpu()
