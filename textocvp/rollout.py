@@ -19,8 +19,10 @@ from textocvp.layers import pixel_grid
 from textocvp.renderers.base import Renderer
 from textocvp.slots import SlotLayout, SlotState
 
-CHUNK = 64
-"""Pictures that the renderer draws at once: enough to keep two cores busy, and small enough for their cache."""
+CHUNK = 64  # pictures that the renderer draws at once: enough to keep two cores busy, and few enough for their cache
+
+
+Draw = Callable[[Tensor], tuple[Tensor, ...]]  # of slots (N, K, D)
 
 
 @dataclass
@@ -37,21 +39,14 @@ class Rollout:
 
     All tensors are float32 without gradient, on the model's device. Slots keep their number through time: slot 3 of
     frame 20 is the thing that was slot 3 in frame 0.
-
-    Attributes:
-        slots: (B, T, K, D).
-        texts: the B instructions; empty if the rollout comes from `WorldModel.parse`.
-        image_size: (H, W) in pixels.
-        layout: what the D numbers of a slot mean.
-        renderer: draws the slots.
-        attention: (B, T - 1, layers, heads, K, words) weights from slots to words, if they were asked for.
     """
 
-    slots: Tensor
-    texts: tuple[str, ...]
-    image_size: tuple[int, int]
-    layout: SlotLayout
-    renderer: Renderer
+    slots: Tensor  # (B, T, K, D)
+    texts: tuple[str, ...]  # the B instructions; empty if the rollout comes from `WorldModel.parse`
+    image_size: tuple[int, int]  # (H, W) in pixels
+    layout: SlotLayout  # what the D numbers of a slot mean
+    renderer: Renderer  # draws the slots
+    # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for.
     attention: Tensor | None = None
     _decoded: _Decoded = field(default_factory=_Decoded)
 
@@ -71,11 +66,7 @@ class Rollout:
     # ---- what the slots look like
 
     def decode_masks(self, frames: slice | Sequence[int]) -> Tensor:
-        """Masks (B, t, K, H, W) of only these frames; see `masks`.
-
-        Raises:
-            IndexError: if there is no such frame.
-        """
+        """Masks (B, t, K, H, W) of only these frames; an IndexError if there is no such frame."""
         times, decoded = self._times(frames), self._decoded.masks
         new = [t for t in dict.fromkeys(times) if t not in decoded]
         if new:
@@ -84,11 +75,7 @@ class Rollout:
         return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_frames(self, frames: slice | Sequence[int]) -> Tensor:
-        """Pictures (B, t, 3, H, W) of only these frames; see `frames`.
-
-        Raises:
-            IndexError: if there is no such frame.
-        """
+        """Pictures (B, t, 3, H, W), RGB 0..1, of only these frames; an IndexError if there is no such frame."""
 
         def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
             rendered = self.renderer(slots_NKD)
@@ -104,10 +91,10 @@ class Rollout:
         return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_objects(self, frames: slice | Sequence[int]) -> Tensor:
-        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames.
+        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames. These pictures are not kept.
 
         A picture fills the whole frame; multiply it by its mask to cut the object out. Summed over the slots that
-        gives the frame, unless the renderer overshoots 0..1. These pictures are not kept.
+        gives the frame, unless the renderer overshoots 0..1.
 
         Raises:
             IndexError: if there is no such frame.
@@ -137,9 +124,7 @@ class Rollout:
         return times
 
     @torch.no_grad()
-    def _draw(
-        self, times: list[int], draw: Callable[[Tensor], tuple[Tensor, ...]], at_once: int = CHUNK
-    ) -> list[Tensor]:
+    def _draw(self, times: list[int], draw: Draw, at_once: int = CHUNK) -> list[Tensor]:
         """What `draw` makes of these frames' slots (N, K, D): its results, each (B, t, ...)."""
         B, _, K, D = self.slots.shape
         drawn = [draw(slots_NKD) for slots_NKD in self.slots[:, times].reshape(-1, K, D).split(at_once)]

@@ -26,7 +26,6 @@ def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEnc
             then built from it alone, for the checkpoint's tensors to fill.
 
     Raises:
-        WeightsError: if its pretrained weights are missing or others than the configuration says; the message says
-            where to get them.
+        WeightsError: if pretrained weights are missing or not those of the configuration; it says where to get them.
     """
     return ENCODERS[config.kind](config, files)
