@@ -121,7 +121,7 @@ def check_parts(config: ModelConfig) -> None:
                 way = f"set renderer.{name}={wanted}"
                 raise ValueError(f"renderer.{name} is {has}, the encoder's features have {wanted}: {way}")
     if getattr(config.predictor, "color_bias", False):  # an option of predictors that attend to the text
-        needs = None
+        needs = ""
         if not text.words_have_rgb:
             needs = f"words that carry RGB, which is text.kind=lexicon, not {text.kind!r}"
         elif not layout.explicit:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,9 +117,8 @@ class Rollout:
         return self.decode_frames(slice(None))
 
     def _times(self, frames: slice | Sequence[int]) -> list[int]:
-        """Frame numbers 0..T-1 of a slice or of numbers that may count from the end."""
         T = self.slots.shape[1]
-        times = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
+        times = _numbers(T, frames)
         if not times:
             raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
         return times
@@ -189,40 +189,28 @@ class Rollout:
         Raises:
             IndexError: if there is no such sequence.
         """
-        B = len(self)
-        if isinstance(index, slice):
-            keep = list(range(B)[index])
-        elif isinstance(index, Sequence) or np.ndim(index):
-            keep = [range(B)[int(i)] for i in index]  # type: ignore[union-attr]
-        else:
-            keep = [range(B)[int(index)]]
+        keep = _numbers(
+            len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index]
+        )
+        decoded = self._decoded
+        kept = ({t: drawn[keep] for t, drawn in kind.items()} for kind in (decoded.masks, decoded.frames))
         return replace(
             self,
             slots=self.slots[keep],
             texts=tuple(self.texts[i] for i in keep) if self.texts else (),
             attention=None if self.attention is None else self.attention[keep],
-            _decoded=_Decoded(
-                {t: masks[keep] for t, masks in self._decoded.masks.items()},
-                {t: frames[keep] for t, frames in self._decoded.frames.items()},
-            ),
+            _decoded=_Decoded(*kept),
         )
 
     @property
     def last(self) -> Rollout:
         """The rollout of only the last frame: where a next instruction would start from."""
-        end = self.slots.shape[1] - 1
-        return replace(
-            self,
-            slots=self.slots[:, -1:],
-            attention=None,
-            _decoded=_Decoded(
-                {0: self._decoded.masks[end]} if end in self._decoded.masks else {},
-                {0: self._decoded.frames[end]} if end in self._decoded.frames else {},
-            ),
-        )
+        end, decoded = self.slots.shape[1] - 1, self._decoded
+        kept = ({0: kind[end]} if end in kind else {} for kind in (decoded.masks, decoded.frames))
+        return replace(self, slots=self.slots[:, -1:], attention=None, _decoded=_Decoded(*kept))
 
     def save(self, path: str | Path, *, beside: np.ndarray | None = None, fps: int = 6) -> Path:
-        """Draw the rollout into a file: each frame with its masks, in one stable colour for each slot.
+        """Draw frames and masks, in one stable colour for each slot, into a file; returns its path.
 
         Args:
             path: `.gif` and `.mp4` play through time, `.png` is a strip from left to right.
@@ -230,14 +218,16 @@ class Rollout:
                 earlier than the rollout, the last one stays.
             fps: frames per second of `.gif` and `.mp4`.
 
-        Returns:
-            The path.
-
         Raises:
             ValueError: if the suffix is another one, or `beside` has another shape.
         """
         frames, masks = self.frames.cpu().numpy(), self.masks.cpu().numpy()
         return save_film(Path(path), frames, masks, self.texts, beside=beside, fps=fps)
+
+
+def _numbers(count: int, index: Any) -> list[int]:
+    """The numbers 0..count-1 of a slice, or of numbers that may count from the end."""
+    return list(range(count)[index]) if isinstance(index, slice) else [range(count)[int(i)] for i in index]
 
 
 def _to_rgb(pictures: Tensor) -> Tensor:

@@ -168,12 +168,15 @@ class SlotAttention(nn.Module):
         Args:
             given_BKL: the attention of all iterations, where it is known (clusters); sums to 1 over the slots.
         """
+        if iterations < 1:
+            raise ValueError(f"slot attention needs at least 1 iteration, not {iterations}")
         B, K, D = slots_BKD.shape
         features_BLD = self.norm_features(features_BLD)
         keys_BLD, values_BLD = self.key(features_BLD), self.value(features_BLD)
         for _ in range(iterations):
-            attention_BKL = given_BKL
-            if attention_BKL is None:
+            if given_BKL is not None:
+                attention_BKL = given_BKL
+            else:
                 queries_BKD = self.query(self.norm_slots(slots_BKD)) * D**-0.5
                 attention_BKL = torch.softmax((queries_BKD @ keys_BLD.transpose(1, 2)).float(), dim=1)
             # The small constant keeps a slot that won nothing at the mean of all locations instead of at 0/0.

@@ -7,6 +7,7 @@ features become 384x384, and resize the result to the size of the frames.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -27,12 +28,8 @@ class CnnDecoder(nn.Module):
         self.image_size = image_size
         widths = [feature_dim, *(channels >> i for i in range(DOUBLINGS))]
         blocks: list[nn.Module] = []
-        for i in range(DOUBLINGS):
-            blocks += [
-                nn.Conv2d(widths[i], widths[i + 1], 3, padding=1),
-                nn.ReLU(),
-                nn.Upsample(scale_factor=2),
-            ]
+        for wide, narrow in pairwise(widths):
+            blocks += [nn.Conv2d(wide, narrow, 3, padding=1), nn.ReLU(), nn.Upsample(scale_factor=2)]
         self.blocks = nn.Sequential(*blocks, nn.Conv2d(widths[-1], 3, 3, padding=1))
 
     def forward(self, features_NFhw: Tensor) -> Tensor:

@@ -68,11 +68,7 @@ def position_code(cells: int) -> Tensor:
 
 
 class PatchDecoder(nn.Module):
-    """Slots (B, K, D) to `out_dim` numbers at each of `cells` x `cells` places, (B, K, L, out_dim).
-
-    L = cells * cells, row by row. The MLP's input is a slot beside the code of a place. Its first layer is linear in
-    both, so it is computed once a slot and once a place and added, without L times K copies of the slots.
-    """
+    """Slots (B, K, D) to `out_dim` numbers at each of L = `cells` x `cells` places, (B, K, L, out_dim), row by row."""
 
     codes_LC: Tensor
 
@@ -80,6 +76,8 @@ class PatchDecoder(nn.Module):
         super().__init__()
         codes_LC = position_code(cells)
         self.register_buffer("codes_LC", codes_LC, persistent=False)
+        # The first layer is linear in the slot and in the code of the place, so it is computed once for each and added:
+        # there are no L times K copies of the slots.
         self.slot = nn.Linear(slot_dim, hidden)
         self.place = nn.Linear(codes_LC.shape[-1], hidden, bias=False)
         inner: list[nn.Module] = [nn.ReLU()]

@@ -21,9 +21,8 @@ ENCODERS: dict[str, type[TextEncoder]] = {
 def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEncoder:
     """The text encoder that `config.kind` names.
 
-    Args:
-        files: the folder that `save_files` was given, of a checkpoint that is being loaded. A fine-tuned encoder is
-            then built from it alone, for the checkpoint's tensors to fill.
+    `files` is the folder that `save_files` was given, of a checkpoint that is being loaded. A fine-tuned encoder is
+    built from it alone, for the checkpoint's tensors to fill.
 
     Raises:
         WeightsError: if pretrained weights are missing or not those of the configuration; it says where to get them.

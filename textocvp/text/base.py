@@ -111,7 +111,7 @@ class TextEncoder(nn.Module):
         """Vocabulary rows and lexicon colours of the sentences, padded to the longest.
 
         Raises:
-            ValueError: if a sentence has no word at all or more than `max_tokens` tokens.
+            ValueError: if a sentence has no word or more than `max_tokens` tokens.
         """
         if isinstance(texts, str):
             raise TypeError("texts must be a sequence of sentences, not one string")

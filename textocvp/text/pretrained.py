@@ -58,11 +58,7 @@ class PretrainedTextConfig(TextConfig):
         return PretrainedFiles(f"text.kind={self.kind}", "text.weights", "text.fingerprint", hub_id, FILES)
 
     def weights_folder(self) -> Path:
-        """The folder with the pretrained weights.
-
-        Raises:
-            WeightsError: if there is none; the message says what to download or install, and where to put it.
-        """
+        """The folder with the pretrained weights; else a WeightsError says what to download or install."""
         if self.kind == "t5" or self.weights:
             return self.files.folder(self.weights)
         package = find_spec(MINILM_PACKAGE)
@@ -143,9 +139,8 @@ class PretrainedEncoder(TextEncoder):
         self._tokenizer = read_tokenizer(folder)
         longest = getattr(self._architecture, "max_position_embeddings", None)  # T5 has no limit
         if longest is not None and config.max_tokens > longest:
-            raise ValueError(
-                f"text.max_tokens={config.max_tokens}: {config.kind} reads {longest} tokens at most"
-            )
+            most = f"{config.kind} reads {longest} tokens at most"
+            raise ValueError(f"text.max_tokens={config.max_tokens}: {most}")
         self.pad = self._architecture.pad_token_id
         encoder = build_encoder(
             self._architecture
