@@ -47,8 +47,7 @@ def palette() -> dict[tuple[str, ...], RGB]:
 
 
 @cache
-def longest_name() -> int:
-    """Words in the longest colour name."""
+def _longest_name() -> int:
     return max(map(len, palette()))
 
 
@@ -141,7 +140,7 @@ class WordEncoder(TextEncoder):
         return merged
 
     def _color_length(self, words: list[str], at: int) -> int:
-        for length in range(min(longest_name(), len(words) - at), 1, -1):
+        for length in range(min(_longest_name(), len(words) - at), 1, -1):
             if tuple(words[at : at + length]) in palette():
                 return length
         return 1
