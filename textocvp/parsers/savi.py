@@ -17,39 +17,30 @@ from torch import Tensor, nn
 from textocvp.layers import PositionCode, init_relu_
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
-from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder, cells_along
+from textocvp.parsers.dino import DinoEncoder, cells_along
 from textocvp.slots import SlotLayout
 
 
 @dataclass(frozen=True)
 class SaviConfig(ParserConfig):
-    """Options of `SaviParser`: encoder -> initializer -> corrector -> transition.
-
-    Attributes:
-        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour
-            and place, or of the frozen encoder's features.
-        encoder: `conv` (learned) or `dinov2` (frozen).
-        encoder_channels: width of the convolutional encoder.
-        encoder_stride: stride of its first convolution.
-        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
-        encoder_dim, encoder_patch: width of its features and side of its patches in pixels.
-        encoder_fingerprint: of its weights, set when a model that has used them is saved; others are then an error.
-        iterations_first: corrector iterations on the first frame; later frames take one.
-        transition_heads, transition_hidden: the transformer block between frames.
-    """
+    """Options of `SaviParser`: encoder -> initializer -> corrector -> transition."""
 
     kind: Literal["savi"] = "savi"
     layout: SlotLayout = SlotLayout(content=64, explicit=False)
+    # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, or
+    # of the frozen encoder's features.
     initializer: Literal["gaussian", "cluster"] = "cluster"
-    encoder: Literal["conv", "dinov2"] = "conv"
-    encoder_channels: int = 32
-    encoder_stride: int = 1
+    encoder: Literal["conv", "dinov2"] = "conv"  # learned, or frozen
+    encoder_channels: int = 32  # width of the convolutional encoder
+    encoder_stride: int = 1  # of its first convolution
+    # Folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
     encoder_weights: str = ""
-    encoder_dim: int = 768
-    encoder_patch: int = 14
+    encoder_dim: int = 768  # width of its features
+    encoder_patch: int = 14  # side of its patches in pixels
+    # Of its weights, set when a model that has used them is saved; others are an error.
     encoder_fingerprint: str = ""
-    iterations_first: int = 1
-    transition_heads: int = 4
+    iterations_first: int = 1  # of the corrector on the first frame; later frames take one
+    transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128
 
     def __post_init__(self) -> None:
@@ -65,14 +56,7 @@ class SaviConfig(ParserConfig):
 
 
 class ConvEncoder(nn.Module):
-    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code,
-    location-wise MLP.
-
-    Args:
-        channels: width of the convolutions (32 in the paper).
-        stride: stride of the first one (1 in the paper: features at every pixel).
-        out_dim: D, the slots' width.
-    """
+    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code, local MLP."""
 
     def __init__(self, channels: int, stride: int, out_dim: int) -> None:
         super().__init__()
@@ -92,10 +76,7 @@ class ConvEncoder(nn.Module):
 
 
 class FeatureProjection(nn.Module):
-    """Features of a frozen encoder (N, F, h, w) to those that slots compete for (N, D, h, w): a location-wise MLP.
-
-    They know their places already, so there is no position code.
-    """
+    """Features of a frozen encoder (N, F, h, w), which know their places, to those for the slots (N, D, h, w)."""
 
     def __init__(self, feature_dim: int, out_dim: int) -> None:
         super().__init__()
@@ -135,15 +116,7 @@ class GaussianInitializer(nn.Module):
 
 
 class ClusterSlots(nn.Module):
-    """First slots from clusters: the mean feature of each cluster, through a small MLP.
-
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
-    family a slot has no presence that could switch it off.
-
-    Args:
-        slot_dim: D.
-        clusters: finds them in what `forward` is given.
-    """
+    """First slots from clusters: the mean feature of each cluster, through a small MLP."""
 
     def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
         super().__init__()
@@ -151,6 +124,7 @@ class ClusterSlots(nn.Module):
         self.mlp = nn.Sequential(
             nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
         )
+        # What a cluster without pixels gives: a slot like any other, since it has no presence that could be 0.
         self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
 
     def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
@@ -171,8 +145,8 @@ class ClusterSlots(nn.Module):
 class SlotAttention(nn.Module):
     """The corrector: slots compete for locations, then each is updated with the mean of what it won.
 
-    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the
-    locations; the update is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
+    Weights are a softmax over the slots, renormalised over the locations; the update is a GRU and a residual MLP
+    (Locatello et al. 2020; TextOCVP equations 1 and 2).
     """
 
     def __init__(self, slot_dim: int, hidden: int) -> None:
@@ -189,14 +163,10 @@ class SlotAttention(nn.Module):
     def forward(
         self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, given_BKL: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
-        slots.
+        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the slots.
 
         Args:
             given_BKL: the attention of all iterations, where it is known (clusters); sums to 1 over the slots.
-
-        Raises:
-            ValueError: if `iterations` is below 1.
         """
         if iterations < 1:
             raise ValueError(f"slot attention needs at least 1 iteration, not {iterations}")
@@ -221,9 +191,8 @@ class SlotAttention(nn.Module):
 class SaviParser(SceneParser):
     """Slot attention for video over clips.
 
-    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
-    unless the same generator state is given. With `cluster` the clusters are the attention on the first frame, and
-    slots compete for locations from the second frame on.
+    Slots keep their number through a clip. With `cluster` the clusters are the attention on the first frame, and slots
+    compete for locations from the second frame on.
     """
 
     Config = SaviConfig
@@ -234,7 +203,7 @@ class SaviParser(SceneParser):
         dim = config.layout.dim
         if config.encoder == "dinov2":
             self.dino = DinoEncoder(
-                config.encoder_weights or DINO_HUB_ID,
+                config.encoder_weights,
                 dim=config.encoder_dim,
                 patch=config.encoder_patch,
                 fingerprint=config.encoder_fingerprint,

@@ -19,8 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
-from textocvp.layers import KeyValueCache
-from textocvp.layers import mask_bias
+from textocvp.layers import KeyValueCache, mask_bias
 from textocvp.text.base import TextTokens
 
 Axis = Literal["time", "height", "width"]
