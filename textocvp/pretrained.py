@@ -11,15 +11,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from huggingface_hub import snapshot_download
-from transformers import PretrainedConfig, PreTrainedModel
-from transformers.utils import logging
+
+if TYPE_CHECKING:  # importing transformers takes seconds, and most models need none of it
+    from transformers import PretrainedConfig, PreTrainedModel
 
 CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE = "config.json", "model.safetensors", "tokenizer.json"
 
-M = TypeVar("M", bound=PreTrainedModel)
+M = TypeVar("M", bound="PreTrainedModel")
 
 
 class WeightsError(ValueError):
@@ -121,6 +122,8 @@ def read_model(kind: type[M], folder: Path, **options: Any) -> M:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep transformers from reporting what is checked here anyway."""
+    from transformers.utils import logging
+
     verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()

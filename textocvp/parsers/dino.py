@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from transformers import Dinov2Config, Dinov2Model
 
 from textocvp.pretrained import PretrainedFiles, WeightsError, read_model
 
@@ -76,6 +75,8 @@ class DinoEncoder(nn.Module):
             WeightsError: if they are missing or damaged, of another size, or not those of `fingerprint`.
         """
         if not self._backbone:
+            from transformers import Dinov2Config, Dinov2Model  # takes seconds, and only this needs them
+
             settings = (f"{self.part}.encoder_weights", f"{self.part}.encoder_fingerprint")
             files = PretrainedFiles("the image encoder", *settings, DINO_HUB_ID)
             folder = files.folder(self.weights)

@@ -11,12 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from tokenizers import Tokenizer
 from torch import Tensor, nn
-from transformers import BertConfig, BertModel, PretrainedConfig, T5Config, T5EncoderModel
 
 from textocvp.layers import full_precision
 from textocvp.pretrained import (
@@ -28,6 +27,9 @@ from textocvp.pretrained import (
     read_model,
 )
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
+
+if TYPE_CHECKING:
+    from transformers import PretrainedConfig
 
 FILES = (CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE)
 T5_HUB_ID = "google-t5/t5-small"
@@ -131,6 +133,8 @@ class PretrainedEncoder(TextEncoder):
     _here: Tensor
 
     def __init__(self, config: PretrainedTextConfig, files: Path | None = None) -> None:
+        from transformers import BertConfig, T5Config  # takes seconds, and only these encoders need them
+
         super().__init__(config)
         stored = files if not config.frozen else None
         folder = stored or config.weights_folder()
@@ -201,6 +205,8 @@ def read_tokenizer(folder: Path) -> Tokenizer:
 
 def build_encoder(config: PretrainedConfig, folder: Path | None = None) -> nn.Module:
     """The encoder of that architecture, with the weights in `folder` or random ones; errors as `read_model`."""
+    from transformers import BertConfig, BertModel, T5Config, T5EncoderModel
+
     # Of T5 only the stack: its embedding table is registered twice in the whole model.
     if isinstance(config, T5Config):
         return (read_model(T5EncoderModel, folder) if folder else T5EncoderModel(config)).encoder
