@@ -219,6 +219,15 @@ def curve_plot(
     )
 
 
+def plot_curves(name: str, spec: TableSpec, rows: Iterable[Row], *, label: str) -> Figure:
+    """The figures of a table as a `curve_plot`: its columns are the frames, its lines the curves that were measured."""
+    rows = list(rows)
+    points = [[point for point in spec.points(rows, line) if point] for line in spec.lines]
+    drawn = [(line, np.array(its)) for line, its in zip(spec.lines, points, strict=True) if its]
+    curves, hues = [(line.name, curve) for line, curve in drawn], [line.hue for line, _ in drawn]
+    return curve_plot(name, curves, label=label, across="frame", caption=spec.caption, colors=hues)
+
+
 def picture_grid(
     name: str,
     pictures: Sequence[Sequence[np.ndarray]],

@@ -20,9 +20,9 @@ from textocvp.metrics.perceptual import MetricUnavailable, PerceptualDistance, l
 BOTTOM_ROWS = 10
 #: Equal frames have an infinite PSNR, which no mean survives. 60 dB is a mean error of a quarter of a grey level.
 PSNR_CAP = 60.0
-#: Metric -> name in tables. Lower is better for the distances.
+#: Metric -> name in tables. Lower is better for the distances, which JEDi is one of.
 PERCEPTUAL = {"lpips": "LPIPS", "st_lpips": "ST-LPIPS"}
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", **PERCEPTUAL}
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", **PERCEPTUAL, "jedi": "JEDi"}
 UPPER = "_without_bottom_rows"
 
 
@@ -64,7 +64,7 @@ class Measures:
     @property
     def absent(self) -> str:
         """Sentences for a report; empty if nothing is absent."""
-        return " ".join(f"{METRICS.get(name, 'JEDi')} is absent: {reason}." for name, reason in self.reasons)
+        return " ".join(f"{METRICS[name]} is absent: {reason}." for name, reason in self.reasons)
 
 
 def available_measures(
