@@ -13,7 +13,7 @@ where a checkpoint can look as far. Writes `results.json`, `report.html`, plots 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -34,23 +34,19 @@ from experiments.study.scenes import StudyScene, study_scenes
 from planning import Instruction, SegmentationGrounder
 
 SPLIT = "test"
-LENGTHS = (
-    9,
-    19,
-    HORIZON,
-    40,
-)  # the paper's two, a whole episode, and far beyond what most models are trained for
+FARTHEST = 40  # predicted frames, for models that can look as far
+LENGTHS = (9, 19, HORIZON, FARTHEST)  # the paper's two, a whole episode, and far beyond it
 MOMENTS = (0, 4, 9, 14, 19, 24)  # that a strip shows
-FIELDS = {
-    "iou": "iou", "iou_moving": "moving", "iou_named_block": "block", "iou_arm": "arm", "iou_still": "still",
-    "iou_kept": "kept", "iou_kept_moving": "kept_moving", "foreground_ari": "ari",
-}  # fmt: skip
-"""Metric -> field of `MaskScores`."""
 OTHERS = ("true frames", "OCVP-Seq", "copy seed", "wrong text")
-MEASURED = ("ours", OURS_40, *OTHERS)
-LINES = lines(MEASURED)
-MEANS = {n: f"frames 1-{n}" for n in LENGTHS}  # variants of the rows
-ALONE = {n: f"frame {n}" for n in LENGTHS}
+LINES = lines(["ours", OURS_40, *OTHERS])
+# Metric -> field of `MaskScores`, and title of its column.
+METRICS = {
+    "iou": ("iou", "all"), "iou_moving": ("moving", "moving"), "iou_named_block": ("block", "named block"),
+    "iou_arm": ("arm", "arm"), "iou_still": ("still", "still objects"), "iou_kept": ("kept", "kept slot"),
+    "iou_kept_moving": ("kept_moving", "kept slot, moving"), "foreground_ari": ("ari", "foreground ARI"),
+}  # fmt: skip
+Outcome = Mapping[str, MaskScores]
+"""Of one scene, by method. A method that cannot look as far ahead as another has fewer frames."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +64,6 @@ QUICK, DEFAULT = Sizes(scenes=24, clips=10, apart=1), Sizes(scenes=100, clips=10
 # --- units of work ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectOutcome:
-    """One scene, measured. A method that cannot look as far ahead as another has fewer frames."""
-
-    scene: StudyScene  # which
-    scores: Mapping[str, MaskScores]  # by method
-
-
 @dataclass(frozen=True)
 class ObjectScene:
     """A unit of work: one scene under all methods."""
@@ -84,21 +72,20 @@ class ObjectScene:
     models: tuple[Model, ...]
     seed: int
 
-    def run(self, worker: Worker) -> ObjectOutcome:
+    def run(self, worker: Worker) -> Outcome:
         """Imagine it, play it, compare."""
-        truth, predictions = predict(worker, self.scene, self.models, horizon=LENGTHS[-1], seed=self.seed)
+        truth, predictions = predict(worker, self.scene, self.models, horizon=FARTHEST, seed=self.seed)
         labels = {one.method: labels_of(one.rollout)[0] for one in predictions if one.rollout is not None}
         longest = max(map(len, labels.values()))
         labels["copy seed"] = hold_last(labels["ours"][:1], longest)
         labels["true frames"] = hold_last(labels["true frames"], longest)
         true_THW, block = truth.segmentations_THW, truth.sampled.named_block
-        scores = {key: score_masks(its, true_THW[: len(its)], block) for key, its in labels.items()}
-        return ObjectOutcome(self.scene, scores)
+        return {key: score_masks(its, true_THW[: len(its)], block) for key, its in labels.items()}
 
 
 @dataclass(frozen=True)
 class SlotStrip:
-    """A unit of work: a scene's camera, what is imagined, and every thing cut out of it, at some moments."""
+    """A unit of work: what the camera sees, what is imagined, and every thing cut out of that, at some moments."""
 
     clip: PredictionClip  # of the same scene
 
@@ -109,12 +96,11 @@ class SlotStrip:
         assert ours.rollout is not None
         times = [t for t in MOMENTS if t < len(ours.frames_T3HW)]
         rows = {"camera": truth.frames_THW3[times], "imagined": to_uint8(ours.frames_T3HW[times])}
-        objects_tK3HW = ours.rollout.decode_objects(times)[0]
-        masks_tKHW = ours.rollout.decode_masks(times)[0]
+        objects_tK3HW, masks_tKHW = ours.rollout.decode_objects(times)[0], ours.rollout.decode_masks(times)[0]
         seen = SegmentationGrounder.from_info(truth.sampled.info)(ours.rollout)
         named = Instruction.parse(truth.text).things
         things = sorted(seen.things, key=lambda thing: (thing not in named, thing.kind, thing.color))
-        slots = {f"{one}{' (named)' if one in named else ''}": seen.things[one] for one in things}
+        slots = {f"{thing}{' (named)' if thing in named else ''}": seen.things[thing] for thing in things}
         for name, its in {**slots, "arm": seen.arm, "table": seen.background}.items():
             if its:
                 rows[name] = _cut_out(objects_tK3HW[:, list(its)], masks_tKHW[:, list(its)])
@@ -128,95 +114,88 @@ class SlotStrip:
 
 def _cut_out(objects_tk3HW: torch.Tensor, masks_tkHW: torch.Tensor) -> np.ndarray:
     """Some slots together on nothing: (t, H, W, 4) uint8, as transparent as the other slots cover them."""
-    alpha_tHW = masks_tkHW.sum(1)
-    color_t3HW = (objects_tk3HW * masks_tkHW[:, :, None]).sum(1) / alpha_tHW[:, None].clamp_min(1e-6)
-    return to_uint8(torch.cat([color_t3HW, alpha_tHW[:, None]], dim=1).clamp(0, 1))
+    alpha_t1HW = masks_tkHW.sum(1, keepdim=True)
+    color_t3HW = (objects_tk3HW * masks_tkHW[:, :, None]).sum(1) / alpha_t1HW.clamp_min(1e-6)
+    return to_uint8(torch.cat([color_t3HW, alpha_t1HW], dim=1).clamp(0, 1))
 
 
 def units(run: Run) -> dict[str, Part]:
     """The scenes."""
-    scenes = study_scenes(SPLIT, run.sizes.scenes, run.args.seed)
-    clips = min(2 * run.sizes.clips, len(scenes))
+    scenes, sizes = study_scenes(SPLIT, run.sizes.scenes, run.args.seed), run.sizes
     return {
-        "scenes": Part([ObjectScene(scene, run.models, run.args.seed) for scene in scenes], 1.0),
-        "clips": Part(seconds=0.5, count=clips),
-        "slots apart": Part(seconds=0.5, count=min(2 * run.sizes.apart, clips)),
+        "scenes": Part([ObjectScene(scene, run.models, run.args.seed) for scene in scenes], 0.7),
+        "clips": Part(seconds=0.2, count=min(2 * sizes.clips, len(scenes))),
+        "slots apart": Part(seconds=0.5, count=min(2 * sizes.apart, len(scenes))),
     }
 
 
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
-    """The best and the worst scenes; of the first of them, every slot drawn alone."""
-    clips = object_clips(found["scenes"], run.args.seed, run.sizes.clips)
+    """The best and the worst scenes by the overlap of what moves; of the first of them, every slot drawn alone."""
+    moving = [float(np.nanmean(outcome["ours"].moving[1:])) for outcome in found["scenes"]]
+    clips = [
+        PredictionClip(scene, (), run.args.seed, "objects", f"block and arm overlap by {value:.2f}")
+        for scene, value in zip(study_scenes(SPLIT, len(moving), run.args.seed), moving, strict=True)
+    ]
+    clips = extreme_clips(clips, [-value for value in moving], run.sizes.clips)
     return {
         "clips": clips,
         "slots apart": [SlotStrip(clip) for clip in clips if clip.rank <= run.sizes.apart],
     }
 
 
-def object_clips(outcomes: Sequence[ObjectOutcome], seed: int, count: int) -> list[PredictionClip]:
-    """The best and the worst scenes by the overlap of what moves, mean over the whole prediction."""
-    moving = [float(np.nanmean(outcome.scores["ours"].moving[1:])) for outcome in outcomes]
-
-    def clip(i: int, rank: int, best: bool) -> PredictionClip:
-        caption = f"block and arm overlap by {moving[i]:.2f}"
-        return PredictionClip(outcomes[i].scene, (), seed, "objects", rank, best, caption)
-
-    return extreme_clips(range(len(outcomes)), [-value for value in moving], count, clip)
-
-
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def rows(run: Run, found: Found) -> list[Row]:
-    """Every figure, as far as there are outcomes."""
-    return [*method_rows(found["scenes"], list(FIELDS)), *difference_rows(found["scenes"])]
-
-
-def predicted(outcomes: Sequence[ObjectOutcome], method: str, metric: str) -> np.ndarray:
-    """(N, T) a metric of every scene in every predicted frame; T is 0 for a method that was not measured."""
-    curves = [getattr(o.scores[method], FIELDS[metric])[1:] for o in outcomes if method in o.scores]
-    return np.stack(curves) if curves else np.empty((0, 0))
-
-
-def method_rows(outcomes: Sequence[ObjectOutcome], metrics: Sequence[str]) -> list[Row]:
+def method_rows(
+    outcomes: Sequence[Outcome], metrics: Iterable[str], lengths: Sequence[int] = LENGTHS
+) -> list[Row]:
     """Every method's figures: the mean up to each length, and that frame alone, as far as it can look ahead."""
     made = []
-    for method, metric in product(MEASURED, metrics):
-        curves_NT = predicted(outcomes, method, metric)
-        for n in (n for n in LENGTHS if n <= curves_NT.shape[1]):
-            for variant, values_N in ((MEANS[n], _means(curves_NT[:, :n])), (ALONE[n], curves_NT[:, n - 1])):
-                if not np.isnan(values_N).all():
-                    made.append(mean_row(method, SPLIT, variant, metric, values_N))
+    for line, metric in product(LINES, metrics):
+        curves_NT = _predicted(outcomes, line.key, metric)
+        for n in (n for n in lengths if n <= curves_NT.shape[1]):
+            means_N, alone_N = _means(curves_NT[:, :n]), curves_NT[:, n - 1]
+            for variant, values_N in ((f"frames 1-{n}", means_N), (f"frame {n}", alone_N)):
+                if not np.isnan(values_N).all():  # something was seen
+                    made.append(mean_row(line.key, SPLIT, variant, metric, values_N))
     return made
 
 
-def difference_rows(outcomes: Sequence[ObjectOutcome]) -> list[Row]:
+def difference_rows(outcomes: Sequence[Outcome]) -> list[Row]:
     """Ours minus each other method, within each scene."""
     made = []
     for method, metric in product(OTHERS, ("iou", "iou_moving")):
-        ours, other = (predicted(outcomes, one, metric) for one in ("ours", method))
+        ours, other = (_predicted(outcomes, one, metric) for one in ("ours", method))
         for n in (n for n in LENGTHS if n <= min(ours.shape[1], other.shape[1])):
-            less = _means(ours[:, :n]) - _means(other[:, :n])
-            made.append(mean_row(f"ours minus {method}", SPLIT, MEANS[n], metric, less))
+            values_N = _means(ours[:, :n]) - _means(other[:, :n])
+            made.append(mean_row(f"ours minus {method}", SPLIT, f"frames 1-{n}", metric, values_N))
     return made
+
+
+def _predicted(outcomes: Sequence[Outcome], method: str, metric: str) -> np.ndarray:
+    """(N, T) a metric of every scene in every predicted frame; T is 0 for a method that was not measured."""
+    curves = [getattr(outcome[method], METRICS[metric][0])[1:] for outcome in outcomes if method in outcome]
+    return np.stack(curves) if curves else np.empty((0, 0))
 
 
 def _means(curves_NT: np.ndarray) -> np.ndarray:
     """Mean over the frames in which there was something to see."""
-    seen = ~np.isnan(curves_NT)
-    sums = np.where(seen, curves_NT, 0.0).sum(axis=1)
-    return np.where(seen.any(axis=1), sums / np.maximum(seen.sum(axis=1), 1), np.nan)
+    return np.ma.masked_invalid(curves_NT).mean(axis=1).filled(np.nan)
 
 
 def headline(run: Run) -> dict[str, Key]:
     """The means over the first 9, 19 and 24 frames."""
-    names, controls = (
-        ("iou", "iou_moving", "foreground_ari"),
-        ("ours", "copy seed", "true frames", "wrong text"),
+    named = product(
+        ("iou", "iou_moving", "foreground_ari"), ("ours", "copy seed", "true frames", "wrong text")
     )
     return {
-        f"{metric.removeprefix('foreground_')}{METHODS[key].ending}_{n}": (key, SPLIT, MEANS[n], metric)
-        for metric, key in (*product(names, controls), ("iou", "OCVP-Seq"))
+        f"{metric.removeprefix('foreground_')}{METHODS[key].ending}_{n}": (
+            key,
+            SPLIT,
+            f"frames 1-{n}",
+            metric,
+        )
+        for metric, key in (*named, ("iou", "OCVP-Seq"))
         for n in LENGTHS[:3]
     }
 
@@ -224,40 +203,41 @@ def headline(run: Run) -> dict[str, Key]:
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 
-def _table(title: str, metric: str, variants: Iterable[str] = MEANS.values()) -> TableSpec:
+def _table(title: str, metric: str, variants: Iterable[str]) -> TableSpec:
     return TableSpec(title, [Column(variant, SPLIT, variant, metric, 3) for variant in variants], LINES)
 
 
-IOU = _table("Mask IoU, all blocks and bowls", "iou")
-MOVING = _table("Mask IoU, named block and arm", "iou_moving")
-ARI = _table("Foreground ARI", "foreground_ari")
+MEANS, ALONE = [f"frames 1-{n}" for n in LENGTHS], [f"frame {n}" for n in LENGTHS]
+IOU = _table("Mask IoU, all blocks and bowls", "iou", MEANS)
+MOVING = _table("Mask IoU, named block and arm", "iou_moving", MEANS)
+ARI = _table("Foreground ARI", "foreground_ari", MEANS)
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    figures, missing, outcomes = list(results.rows), run.missing_keys, found["scenes"]
-    measured = [n for n in LENGTHS if results.find("ours", MEANS[n], "iou")]
-    variants = [*MEANS.values(), *ALONE.values()]
-    differences = TableSpec(
-        "Mask IoU, difference",
-        [
-            Column(f"{name}, 1-{n}", SPLIT, MEANS[n], metric, 3)
-            for metric, name in (("iou", "all"), ("iou_moving", "moving"))
-            for n in measured
-        ],
-        [Line(key=f"ours minus {method}", kind=METHODS[method].kind) for method in OTHERS],
-        "Differences within the same scene, so their intervals are narrower than those of the figures.",
-    )
-    details = {
-        "foreground ARI": "foreground_ari", "named block": "iou_named_block", "arm": "iou_arm",
-        "still objects": "iou_still", "kept slot": "iou_kept", "kept slot, moving": "iou_kept_moving",
-    }  # fmt: skip
+    figures, missing = list(results.rows), run.missing_keys
+    measured = [variant for variant in MEANS if results.find("ours", variant, "iou")]
+    titles = {metric: title for metric, (_, title) in METRICS.items()}
     apart = TableSpec(
-        f"Apart, mean of {MEANS[measured[-1]]}",
-        [Column(title, SPLIT, MEANS[measured[-1]], metric, 3) for title, metric in details.items()],
+        f"Apart, mean of {measured[-1]}",
+        [Column(titles[metric], SPLIT, measured[-1], metric, 3) for metric in list(METRICS)[2:]],
         LINES,
         "Kept slot: each object against the one slot that had it in the first frame.",
     )
+    differences = TableSpec(
+        "Mask IoU, difference",
+        [Column(f"{titles[m]}, {v}", SPLIT, v, m, 3) for m in ("iou", "iou_moving") for v in measured],
+        [Line(key=f"ours minus {method}", kind=METHODS[method].kind) for method in OTHERS],
+        "Differences within the same scene, so their intervals are narrower than those of the figures.",
+    )
+
+    def curves(metric: str, label: str) -> Figure:
+        every = range(1, FARTHEST + 1)
+        spec = replace(
+            _table("", metric, [f"frame {n}" for n in every]), caption="Mean over scenes, 95 % intervals."
+        )
+        return plot_curves(f"{metric}.png", spec, method_rows(found["scenes"], [metric], every), label=label)
+
     return [
         Section(
             "Mask IoU against the simulator",
@@ -266,9 +246,9 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "task, at 336x336, so their order matters more than their height. When an episode is over, its last frame "
             f"stays. {TRAINED_LITTLE} {' '.join(run.remarks)}",
             [
-                _table("All blocks and bowls", "iou", variants).table(figures, missing),
+                _table("All blocks and bowls", "iou", [*MEANS, *ALONE]).table(figures, missing),
                 plot_table("iou_dots.png", IOU, figures, label="mask IoU"),
-                _curves(outcomes, "iou", "mask IoU, all objects", "iou.png"),
+                curves("iou", "mask IoU, all objects"),
             ],
         ),
         Section(
@@ -276,17 +256,14 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "Most objects stand still, and copying the first frame is right about those. What the sentence decides is "
             "where the named block and the arm go.",
             [
-                _table("Named block and arm", "iou_moving", variants).table(figures, missing),
-                _curves(outcomes, "iou_moving", "mask IoU, block and arm", "iou_moving.png"),
+                _table("Named block and arm", "iou_moving", [*MEANS, *ALONE]).table(figures, missing),
+                curves("iou_moving", "mask IoU, block and arm"),
                 differences.table(figures, missing),
             ],
         ),
         Section(
             "Foreground ARI, and object by object",
-            blocks=[
-                apart.table(figures, missing),
-                _curves(outcomes, "foreground_ari", "foreground ARI", "ari.png"),
-            ],
+            blocks=[apart.table(figures, missing), curves("foreground_ari", "foreground ARI")],
         ),
         Section(
             "Every slot drawn alone",
@@ -303,30 +280,15 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     ]
 
 
-def _curves(outcomes: Sequence[ObjectOutcome], metric: str, label: str, name: str) -> Figure:
-    curves = [(method, enumerate(predicted(outcomes, method, metric).T, start=1)) for method in MEASURED]
-    # Frames in which no scene shows the thing cannot be drawn; there are none but in tiny tests.
-    figures = [
-        mean_row(method, SPLIT, f"frame {t}", metric, values_N)
-        for method, curve in curves
-        for t, values_N in curve
-        if not np.isnan(values_N).all()
-    ]
-    frames = [Column("", SPLIT, f"frame {t}", metric) for t in range(1, LENGTHS[-1] + 1)]
-    return plot_curves(
-        name, TableSpec("", frames, LINES, "Mean over scenes, 95 % intervals."), figures, label=label
-    )
-
-
 STUDY = Study(
     name="objects",
     title="Objects",
     question="Do the imagined masks stay on the objects, and does the one that is named go where it should?",
     sizes=lambda args: QUICK if args.quick else DEFAULT,
-    methods=MEASURED,
+    methods=[line.key for line in LINES],
     units=units,
     cases=cases,
-    rows=rows,
+    rows=lambda run, found: [*method_rows(found["scenes"], METRICS), *difference_rows(found["scenes"])],
     tables=(IOU, MOVING, ARI),
     page=page,
     cards=[

@@ -13,7 +13,7 @@ whose weights are installed, is measured anyway. Writes `results.json`, `report.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,14 +72,6 @@ QUICK, DEFAULT = Sizes(scenes=8, clips=4), Sizes(scenes=60, clips=10)
 # --- units of work ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class PredictionOutcome:
-    """One scene, imagined by everybody and measured."""
-
-    scores: tuple[FrameScores, ...]  # of each method, in the order of the table
-    real_features: Mapping[int, np.ndarray]  # length -> (D,) of the real frames, for JEDi
-
-
 @dataclass(frozen=True)
 class PredictionScene:
     """A unit of work: one scene, imagined by every model and every control."""
@@ -89,11 +81,11 @@ class PredictionScene:
     measures: Measures
     seed: int
 
-    def run(self, worker: Worker) -> PredictionOutcome:
-        """Imagine, watch, measure."""
+    def run(self, worker: Worker) -> tuple[FrameScores, ...]:
+        """Imagine, watch, measure: every method in the order of the table; last, what JEDi needs of the truth."""
         truth, predictions = predict(worker, self.scene, self.models, horizon=FARTHEST, seed=self.seed)
         scorer = Scorer(truth.frames_T3HW, self.measures, upper=True)
-        return PredictionOutcome(tuple(map(scorer.score, predictions)), scorer.real_features())
+        return *map(scorer.score, predictions), FrameScores("truth", {}, scorer.real_features())
 
 
 def units(run: Run) -> dict[str, Part]:
@@ -106,7 +98,7 @@ def units(run: Run) -> dict[str, Part]:
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """The best and the worst scenes, by how ours looks over the whole episode, or as far as it looks."""
     metric, seed = run.measures.main, run.args.seed
-    means = [float(outcome.scores[0].curves[metric][:HORIZON].mean()) for outcome in found["scenes"]]
+    means = [float(scores[0].curves[metric][:HORIZON].mean()) for scores in found["scenes"]]
     # An episode is over before it looks farther than ours.
     shown = tuple(model for model in run.models if model.key != OURS_40)
     clips = [
@@ -120,15 +112,10 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def rows(run: Run, found: Found) -> list[Row]:
-    """Every figure, as far as there are outcomes."""
-    return [*frame_rows(found["scenes"]), *jedi_rows(found["scenes"])]
-
-
-def frame_rows(outcomes: Sequence[PredictionOutcome]) -> list[Row]:
+def frame_rows(outcomes: Sequence[Sequence[FrameScores]]) -> list[Row]:
     """Means over the first so many frames, with and without the bottom rows; then every frame alone."""
     lengths, alone = [], []
-    for scores in zip(*(outcome.scores for outcome in outcomes), strict=True):
+    for scores in zip(*outcomes, strict=True):
         place = scores[0].method, SPLIT
         for metric in scores[0].curves:
             curves_NT = np.stack([one.curves[metric] for one in scores])
@@ -139,13 +126,13 @@ def frame_rows(outcomes: Sequence[PredictionOutcome]) -> list[Row]:
     return [*lengths, *alone]
 
 
-def jedi_rows(outcomes: Sequence[PredictionOutcome]) -> list[Row]:
+def jedi_rows(outcomes: Sequence[Sequence[FrameScores]]) -> list[Row]:
     """JEDi at each length; none where its features were not computed."""
     made = []
-    for scores in zip(*(outcome.scores for outcome in outcomes), strict=True):
+    for scores in zip(*(outcome[:-1] for outcome in outcomes), strict=True):
         for length in scores[0].features:
             imagined_ND = np.stack([one.features[length] for one in scores])
-            distance = jedi(imagined_ND, np.stack([one.real_features[length] for one in outcomes]))
+            distance = jedi(imagined_ND, np.stack([outcome[-1].features[length] for outcome in outcomes]))
             made.append(interval_row(scores[0].method, SPLIT, f"{length} frames", "jedi", distance))
     return made
 
@@ -269,7 +256,7 @@ STUDY = Study(
     measures=lambda args: available(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out"),
     units=units,
     cases=cases,
-    rows=rows,
+    rows=lambda run, found: [*frame_rows(found["scenes"]), *jedi_rows(found["scenes"])],
     tables=(PAPER_TABLE, EPISODE_TABLE, UPPER_TABLE),
     page=page,
     cards=cards,

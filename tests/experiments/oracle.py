@@ -29,7 +29,7 @@ def _listen() -> None:
 
     def heard_reset(self: TabletopEnv, *, seed: int | None = None, options: Any = None) -> Any:
         result = reset(self, seed=seed, options=options)
-        _history[:] = [result[1]]
+        _history[:] = [{**result[1], "env": self, "reset": {"seed": seed, "options": options}}]
         return result
 
     def heard_step(self: TabletopEnv, action: Any) -> Any:
