@@ -5,15 +5,14 @@
 
 Mask IoU (paper, section 4.3) and foreground ARI of what is imagined from one frame and a sentence, against the
 simulator's segmentation of what the expert then did. Most objects stand still, so everything is measured once more on
-the named block and the arm alone. Read the tables from below: `copy seed` is what standing still earns, `wrong text`
-what moving the wrong thing earns, `true frames` what this parser can earn at best. Further than 24 frames is measured
-where a checkpoint can look as far. Writes `results.json`, `report.html`, plots and clips into `--out`.
+the named block and the arm alone. `copy seed` is what standing still earns, `wrong text` what moving the wrong thing
+earns, `true frames` what this parser can earn at best. Writes `results.json`, `report.html`, plots and clips.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -45,8 +44,8 @@ METRICS = {
     "iou_arm": ("arm", "arm"), "iou_still": ("still", "still objects"), "iou_kept": ("kept", "kept slot"),
     "iou_kept_moving": ("kept_moving", "kept slot, moving"), "foreground_ari": ("ari", "foreground ARI"),
 }  # fmt: skip
-Outcome = Mapping[str, MaskScores]
-"""Of one scene, by method. A method that cannot look as far ahead as another has fewer frames."""
+Outcomes = Sequence[Mapping[str, MaskScores]]
+"""Of every scene by method. One that cannot look as far ahead as another has fewer frames."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class ObjectScene:
     models: tuple[Model, ...]
     seed: int
 
-    def run(self, worker: Worker) -> Outcome:
+    def run(self, worker: Worker) -> Mapping[str, MaskScores]:
         """Imagine it, play it, compare."""
         truth, predictions = predict(worker, self.scene, self.models, horizon=FARTHEST, seed=self.seed)
         labels = {one.method: labels_of(one.rollout)[0] for one in predictions if one.rollout is not None}
@@ -131,28 +130,24 @@ def units(run: Run) -> dict[str, Part]:
 
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """The best and the worst scenes by the overlap of what moves; of the first of them, every slot drawn alone."""
-    moving = [float(np.nanmean(outcome["ours"].moving[1:])) for outcome in found["scenes"]]
+    moving = [float(np.nanmean(scores["ours"].moving[1:])) for scores in found["scenes"]]
     clips = [
         PredictionClip(scene, (), run.args.seed, "objects", f"block and arm overlap by {value:.2f}")
         for scene, value in zip(study_scenes(SPLIT, len(moving), run.args.seed), moving, strict=True)
     ]
     clips = extreme_clips(clips, [-value for value in moving], run.sizes.clips)
-    return {
-        "clips": clips,
-        "slots apart": [SlotStrip(clip) for clip in clips if clip.rank <= run.sizes.apart],
-    }
+    strips = [SlotStrip(clip) for clip in clips if clip.rank <= run.sizes.apart]
+    return {"clips": clips, "slots apart": strips}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def method_rows(
-    outcomes: Sequence[Outcome], metrics: Iterable[str], lengths: Sequence[int] = LENGTHS
-) -> list[Row]:
+def method_rows(found: Outcomes, metrics: Iterable[str], lengths: Sequence[int] = LENGTHS) -> list[Row]:
     """Every method's figures: the mean up to each length, and that frame alone, as far as it can look ahead."""
     made = []
     for line, metric in product(LINES, metrics):
-        curves_NT = _predicted(outcomes, line.key, metric)
+        curves_NT = _predicted(found, line.key, metric)
         for n in (n for n in lengths if n <= curves_NT.shape[1]):
             means_N, alone_N = _means(curves_NT[:, :n]), curves_NT[:, n - 1]
             for variant, values_N in ((f"frames 1-{n}", means_N), (f"frame {n}", alone_N)):
@@ -161,20 +156,20 @@ def method_rows(
     return made
 
 
-def difference_rows(outcomes: Sequence[Outcome]) -> list[Row]:
+def difference_rows(found: Outcomes) -> list[Row]:
     """Ours minus each other method, within each scene."""
     made = []
     for method, metric in product(OTHERS, ("iou", "iou_moving")):
-        ours, other = (_predicted(outcomes, one, metric) for one in ("ours", method))
+        ours, other = (_predicted(found, one, metric) for one in ("ours", method))
         for n in (n for n in LENGTHS if n <= min(ours.shape[1], other.shape[1])):
             values_N = _means(ours[:, :n]) - _means(other[:, :n])
             made.append(mean_row(f"ours minus {method}", SPLIT, f"frames 1-{n}", metric, values_N))
     return made
 
 
-def _predicted(outcomes: Sequence[Outcome], method: str, metric: str) -> np.ndarray:
+def _predicted(found: Outcomes, method: str, metric: str) -> np.ndarray:
     """(N, T) a metric of every scene in every predicted frame; T is 0 for a method that was not measured."""
-    curves = [getattr(outcome[method], METRICS[metric][0])[1:] for outcome in outcomes if method in outcome]
+    curves = [getattr(scores[method], METRICS[metric][0])[1:] for scores in found if method in scores]
     return np.stack(curves) if curves else np.empty((0, 0))
 
 
@@ -185,17 +180,11 @@ def _means(curves_NT: np.ndarray) -> np.ndarray:
 
 def headline(run: Run) -> dict[str, Key]:
     """The means over the first 9, 19 and 24 frames."""
-    named = product(
-        ("iou", "iou_moving", "foreground_ari"), ("ours", "copy seed", "true frames", "wrong text")
-    )
+    metrics = {"iou": "iou", "iou_moving": "iou_moving", "ari": "foreground_ari"}
+    wanted = product(metrics, ("ours", "copy seed", "true frames", "wrong text"))
     return {
-        f"{metric.removeprefix('foreground_')}{METHODS[key].ending}_{n}": (
-            key,
-            SPLIT,
-            f"frames 1-{n}",
-            metric,
-        )
-        for metric, key in (*named, ("iou", "OCVP-Seq"))
+        f"{name}{METHODS[key].ending}_{n}": (key, SPLIT, f"frames 1-{n}", metrics[name])
+        for name, key in (*wanted, ("iou", "OCVP-Seq"))
         for n in LENGTHS[:3]
     }
 
@@ -203,8 +192,8 @@ def headline(run: Run) -> dict[str, Key]:
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 
-def _table(title: str, metric: str, variants: Iterable[str]) -> TableSpec:
-    return TableSpec(title, [Column(variant, SPLIT, variant, metric, 3) for variant in variants], LINES)
+def _table(title: str, metric: str, variants: Iterable[str], caption: str = "") -> TableSpec:
+    return TableSpec(title, [Column(v, SPLIT, v, metric, 3) for v in variants], LINES, caption)
 
 
 MEANS, ALONE = [f"frames 1-{n}" for n in LENGTHS], [f"frame {n}" for n in LENGTHS]
@@ -233,9 +222,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
 
     def curves(metric: str, label: str) -> Figure:
         every = range(1, FARTHEST + 1)
-        spec = replace(
-            _table("", metric, [f"frame {n}" for n in every]), caption="Mean over scenes, 95 % intervals."
-        )
+        spec = _table("", metric, [f"frame {n}" for n in every], "Mean over scenes, 95 % intervals.")
         return plot_curves(f"{metric}.png", spec, method_rows(found["scenes"], [metric], every), label=label)
 
     return [
@@ -267,14 +254,12 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         ),
         Section(
             "Every slot drawn alone",
-            "What the renderer makes of one slot, cut out by its mask. The names come from the simulator's "
-            "segmentation of the first frame and serve as labels only.",
+            "What the renderer makes of one slot, cut out by its mask; named after the simulator's segmentation.",
             found["slots apart"],
         ),
         Section(
             "Imagined beside real",
-            "The best and the worst scenes by the overlap of block and arm. Below the pictures: the slots' masks "
-            "beside the simulator's segmentation, one colour a thing.",
+            "The best and the worst scenes by the overlap of block and arm. Below: masks, one colour a thing.",
             [Clips(found["clips"])],
         ),
     ]

@@ -3,16 +3,14 @@
     python experiments/prediction.py              # default: some minutes on 2 cores
     python experiments/prediction.py --quick      # a first look
 
-The paper's first study (its section 4.2), on held-out scenes of the tabletop: PSNR, SSIM, LPIPS, ST-LPIPS and JEDi over
-9, 19 and 24 frames (a whole episode), and frame by frame up to 40. Read the tables from below: `copy frame` is what
-standing still earns, `wrong text` what moving the wrong thing earns, `true frames` what this renderer can earn at best.
-LPIPS needs the weights of AlexNet and JEDi those of V-JEPA 2. Without them the report says what to fetch, and ST-LPIPS,
-whose weights are installed, is measured anyway. Writes `results.json`, `report.html`, plots and clips into `--out`.
+The paper's first study (its section 4.2), on held-out scenes: PSNR, SSIM, LPIPS, ST-LPIPS and JEDi over 9, 19 and 24
+frames (a whole episode), and frame by frame up to 40. `copy frame` is what standing still earns, `wrong text` what
+moving the wrong thing earns, `true frames` what this renderer can earn at best. LPIPS needs the weights of AlexNet and
+JEDi those of V-JEPA 2; without them the report says what to fetch. Writes `results.json`, `report.html`, plots, clips.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -158,27 +156,25 @@ def _columns(metrics: Sequence[str], lengths: Sequence[int], view: str = "") -> 
     ]
 
 
-DISTANCES = ("ssim", "lpips", "st_lpips", "jedi")
+SHOWN = ("ssim", "lpips", "st_lpips", "jedi")
 PAPER_TABLE = TableSpec(
     "9 and 19 frames",
-    _columns(DISTANCES, LENGTHS[:2]),
+    _columns(SHOWN, LENGTHS[:2]),
     [*LINES[:-3], Line(key="SEER", kind="baseline", note=SEER), *LINES[-3:]],
     "Means over the first 9 and the first 19 imagined frames. SSIM: higher is better; the others: lower.",
 )
 EPISODE_TABLE = TableSpec(
     "Whole episodes, and PSNR",
-    [*_columns(["psnr"], LENGTHS), *_columns(DISTANCES, [HORIZON])],
+    [*_columns(["psnr"], LENGTHS), *_columns(SHOWN, [HORIZON])],
     LINES,
     f"PSNR in dB, higher is better, averaged frame by frame; equal frames count as {PSNR_CAP:g} dB. "
     f"An episode has {HORIZON} frames after the first.",
 )
 UPPER_TABLE = TableSpec(
-    "Without the bottom rows",
-    _columns(DISTANCES[:3], LENGTHS, UPPER),
-    LINES,
+    "Without the bottom rows", _columns(SHOWN[:3], LENGTHS, UPPER), LINES,
     f"The same without the lowest {BOTTOM_ROWS} rows of pixels. The robot stands beyond the upper edge and hardly ever "
     "reaches down there. So these rows are mostly still table, which is easy.",
-)
+)  # fmt: skip
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
@@ -186,14 +182,12 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     figures, metric = list(results.rows), run.measures.main
     paper, *more = run.tables(figures)
     by_length = TableSpec("", _columns([metric], LENGTHS), LINES)
-    frames = Counter(row.method for row in figures if row.metric == "psnr" and row.variant[:6] == "frame ")
-    short = [f"{method} {count}" for method, count in frames.items() if count < FARTHEST]
+    models = [("ours", run.checkpoint.name, run.world_model.longest_horizon)]
+    models += [(one.key, one.checkpoint, one.longest) for one in run.models]
+    ahead = "; ".join(f"{key} ({name}): {longest or 'any number'}" for key, name, longest in models)
     best, worst = best_and_worst(found["clips"])
     cases = f"By {METRICS[metric]} of ours over the whole episode. Below the pictures: the slots' masks beside the "
     cases += "simulator's segmentation, one colour a thing; for models without slots, what our parser sees."
-    models = [
-        f"{one.key}: {one.checkpoint}, {one.longest or 'any number of'} frames at once" for one in run.models
-    ]
     return [
         Section(
             "As in the paper's table",
@@ -207,16 +201,13 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "Over time",
             f"Curves go to {FARTHEST} frames for models that can look as far. An episode is over after {HORIZON}; from "
             "then on the real video is its last frame, in which the arm rests: in the simulator, frames after the end "
-            "differ from it by less than .2 of 255 grey levels in the mean."
-            + (f" Trained for fewer frames, and drawn so far: {'; '.join(short)}." if short else ""),
+            "differ from it by less than .2 of 255 grey levels in the mean. Frames that each model imagines at once: "
+            f"{ahead}.",
             [_curves(figures, metric) for metric in run.measures.metrics],
         ),
         Section("The best cases", cases, [Clips(best)]),
         Section("The worst cases", cases, [Clips(worst)]),
-        Section(
-            "Who was measured, and what is absent",
-            " ".join([*run.remarks, f"SEER is absent: {SEER}.", f"Beside ours: {'; '.join(models)}."]),
-        ),
+        Section("What is absent", " ".join([*run.remarks, f"SEER is absent: {SEER}."])),
     ]
 
 
@@ -239,11 +230,9 @@ def cards(run: Run, results: Results) -> list[CardSpec]:
         compare = ", ".join(f"{m} {row.value:.{column.digits}f}" for m, row in rivals if row is not None)
         return CardSpec(f"{column.title} frames, {method}", METHODS[method], column, compare, bar=False)
 
-    whole = _columns([run.measures.main], [HORIZON])
-    ours = _columns(("ssim", *run.measures.perceptual[-1:]), LENGTHS)
-    return [card("ours", c) for c in ours] + [
-        card(m, c) for m in ("true frames", "wrong text") for c in whole
-    ]
+    made = [card("ours", column) for column in _columns(("ssim", *run.measures.perceptual[-1:]), LENGTHS)]
+    (whole,) = _columns([run.measures.main], [HORIZON])
+    return [*made, card("true frames", whole), card("wrong text", whole)]
 
 
 STUDY = Study(

@@ -51,14 +51,12 @@ class PredictionClip:
             labels_THW = labels_of(rollout)[0]
             colors = slot_colors(labels_THW[0], info["segmentation"], rollout.slots.shape[2], objects)
             masks.append(paint(labels_THW, colors))
-        # Pictures of many models are noisy and do not pack well; the page enlarges them itself.
-        scale = 2 if len(predictions) < 3 else 1
+        frames = [truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)]
         verdict = "" if self.good is None else ": success" if self.good else ": failure"
         return Clip(
             name=f"{self.group}-{self.place.replace(' ', '-')}.gif",
-            gif=gif(
-                [[truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)], masks], scale=scale
-            ),
+            # Pictures of many models are noisy and do not pack well; the page enlarges them itself.
+            gif=gif([frames, masks], scale=2 if len(predictions) < 3 else 1),
             panels=("real", *(one.method for one in predictions)),
             title=truth.text,
             caption=f"{self.caption}; seed {self.scene.seed}",
@@ -81,14 +79,14 @@ class EpisodeClip:
         sampled = sample_scene(worker.environment(episode.scene), episode.scene, episode.variants)
         result = episode.pursue(worker, sampled)
         imagined = [to_uint8(attempt.plan.rollout.frames[0]) for attempt in result.attempts]
-        steps = f"{result.steps} pick-and-place" + ("s" if result.steps != 1 else "")
+        steps = f"{result.steps} pick-and-place{'s' if result.steps != 1 else ''}"
+        error = f"; {result.error}" if result.error else ""
         return Clip(
             name=f"closed-loop-{self.rank}.gif",
             gif=gif([[np.concatenate(imagined or [result.frames[:1]]), result.frames]]),
             panels=("the plan, imagined", "what happened"),
             title=self.outcome.text,
-            caption=f"{self.column}, seed {episode.scene.seed}; {steps}"
-            + (f"; {result.error}" if result.error else ""),
+            caption=f"{self.column}, seed {episode.scene.seed}; {steps}{error}",
             badge="success" if result.success else "failure",
             tone=tone(result.success),
         )
@@ -104,10 +102,7 @@ def episode_clips(
 ) -> list[EpisodeClip]:
     """Up to `count` failures of ours, and successes with the longest goals: `2 * count` in all.
 
-    Args:
-        outcomes: of all methods.
-        column_of: title of the column that an episode stands in.
-        count: of failures.
+    `column_of` gives the title of the column that an episode stands in.
     """
     ours = [o for o in outcomes if o.episode.method == "ours"]
     failures = [o for o in ours if not o.success][:count]

@@ -75,22 +75,15 @@ def available_measures(
     Args:
         jedi: the V-JEPA that is wanted, or None. without_jedi: why none is.
     """
-    reasons, found = [], []
-    for metric in PERCEPTUAL:
+    reasons = {"jedi": without_jedi} if jedi is None and without_jedi else {}
+    for metric in (*PERCEPTUAL, *(["jedi"] if jedi else [])):
         try:
-            perceptual(metric)
-            found.append(metric)
+            _ = video_features(jedi) if jedi and metric == "jedi" else perceptual(metric)
         except MetricUnavailable as error:
-            reasons.append((metric, str(error)))
-    if jedi is not None:
-        try:
-            video_features(jedi)
-        except MetricUnavailable as error:
-            reasons.append(("jedi", str(error)))
-            jedi = None
-    elif without_jedi:
-        reasons.append(("jedi", without_jedi))
-    return Measures(tuple(found), jedi, jedi_lengths, tuple(reasons))
+            reasons[metric] = str(error)
+    found = tuple(metric for metric in PERCEPTUAL if metric not in reasons)
+    order = [(metric, reasons[metric]) for metric in METRICS if metric in reasons]
+    return Measures(found, None if "jedi" in reasons else jedi, jedi_lengths, tuple(order))
 
 
 @dataclass(frozen=True, eq=False)

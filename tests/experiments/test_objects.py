@@ -2,13 +2,14 @@
 
 import html
 import json
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.objects import STUDY, ObjectScene, Outcome, Sizes, cases, method_rows
+from experiments.objects import STUDY, ObjectScene, Sizes, cases, method_rows
 from experiments.study.mask_metrics import MaskScores, score_masks
 from experiments.study.methods import METHODS, OURS_40, Model, find_models
 from experiments.study.pool import LoadCheckpoint, Worker
@@ -72,7 +73,7 @@ def test_masks_must_fit_the_segmentation() -> None:
 
 
 @lru_cache
-def outcome(kind: str, ahead: int | None = 24) -> Outcome:
+def outcome(kind: str, ahead: int | None = 24) -> Mapping[str, MaskScores]:
     (scene,) = study_scenes("test", 1, 0)
     copies = Model("OCVP-Seq", LoadForesight("copies"), True, "copies", "1" * 64, 24)
     return ObjectScene(scene, (copies,), 0).run(Worker(LoadForesight(kind, ahead)()))  # type: ignore[arg-type]
