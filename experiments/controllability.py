@@ -235,9 +235,8 @@ def predicted_clips(outcomes: Sequence[PredictedOutcome], seed: int, count: int)
         for rank, (success, miss, scene, v) in enumerate(list(firsts.values())[:count], start=1):
             ends = f"block ends {miss:.1f} px from the bowl's centre" if np.isfinite(miss) else "not found"
             caption = f"{'original' if v == 0 else f'variant {v}'}; {ends}"
-            clips.append(
-                PredictionClip(scene, (), seed, "predicted", rank, best, caption, success, v, VARIANTS)
-            )
+            clip = PredictionClip(scene, (), seed, "predicted", caption, success, v, VARIANTS, best, rank)
+            clips.append(clip)
     return clips
 
 

@@ -3,183 +3,255 @@
     python experiments/prediction.py              # default: some minutes on 2 cores
     python experiments/prediction.py --quick      # a first look
 
-The paper's first study (its section 4.2), on held-out scenes of the tabletop: PSNR, SSIM, LPIPS, ST-LPIPS and JEDi over
-9, 19 and 24 frames (a whole episode), and frame by frame up to 40. TextOCVP stands beside OCVP-Seq (slots, no text),
-Non-OC and MAGE (text, no slots), and beside three controls: the first frame repeated, ours with a wrong sentence, and
-parser and renderer on the true frames. A model that is not trained and a metric whose weights are not on this machine
-are absent with the reason. Writes `results.json`, `report.html`, plots and clips into `--out`.
+The paper's first study (its section 4.2), on held-out scenes: PSNR, SSIM, LPIPS, ST-LPIPS and JEDi over 9, 19 and 24
+frames (a whole episode), and frame by frame up to 40. `copy frame` is what standing still earns, `wrong text` what
+moving the wrong thing earns, `true frames` what this renderer can earn at best. LPIPS needs the weights of AlexNet and
+JEDi those of V-JEPA 2; without them the report says what to fetch. Writes `results.json`, `report.html`, plots, clips.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.contenders import FAR, Contender, LoadVideo, LoadVideoModel, find_contenders, hashes
-from experiments.protocol.film_gallery import FilmPicture, extremes, halves
-from experiments.protocol.frame_scores import METRICS, Measures, available_measures
-from experiments.protocol.prediction import (
-    LENGTHS,
-    SPLIT,
-    PredictionOutcome,
-    PredictionScene,
-    frame_rows,
-    jedi_rows,
-    length_rows,
+import numpy as np
+
+from experiments.report.page import CardSpec, Clips, Figure, Section
+from experiments.report.plots import plot_curves, plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Key, Row, interval_row, mean_row
+from experiments.report.tables import Column, Line, TableSpec
+from experiments.study.clips import PredictionClip, best_and_worst, extreme_clips
+from experiments.study.frame_metrics import (
+    BOTTOM_ROWS,
+    METRICS,
+    PSNR_CAP,
+    UPPER,
+    FrameScores,
+    Measures,
+    Scorer,
 )
-from experiments.protocol.prediction_report import build_report, episode_table, paper_table, upper_table
-from experiments.protocol.running import StudyRun
-from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadWorldModel
-from experiments.reporting import Results, Row, StudyProgress
-from textocvp.metrics.jedi import VJEPA
+from experiments.study.frame_metrics import available_measures as available
+from experiments.study.methods import BASELINES, HORIZON, METHODS, OURS_40, TRAINED_LITTLE, Model, lines
+from experiments.study.pool import Unit, Worker
+from experiments.study.predictions import predict
+from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
+from experiments.study.scenes import StudyScene, study_scenes
+from textocvp.metrics.jedi import VJEPA, jedi
 
-# Who is in the headline figures, by the ending of their names.
-NAMED = {
-    "ours": "",
-    "OCVP-Seq": "_ocvp_seq",
-    "Non-OC": "_non_oc",
-    "MAGE": "_mage",
-    "copy frame": "_copy_frame",
-}
-SECONDS = {"scenes": 6.0, "pictures": 2.0}  # of one unit on one core; they only weigh the progress bar
+SPLIT = "test"
+LENGTHS = (9, 19, HORIZON)  # the paper's two, and a whole episode
+FARTHEST = 40  # how far the curves go, for models that can look as far
+IMAGINING = ("ours", OURS_40, *BASELINES, "true frames", "wrong text", "copy frame")
+LINES = lines(IMAGINING)
+SEER = "not run: 406 M parameters, fine-tuned from weights that cannot be rebuilt here"
 
 
 @dataclass
-class Args(StudyArgs):
-    """Prediction quality: imagined frames against what the expert then does in the simulator.
+class Args(ScenesArgs):
+    """Arguments of the prediction study."""
 
-    Read the tables from below: `copy frame` is what standing still earns, `wrong text` what moving the wrong thing
-    earns, `true frames` what this renderer can earn at best. LPIPS needs the weights of AlexNet and JEDi those of
-    V-JEPA 2; without them the report says what to fetch, and ST-LPIPS, whose weights are installed, is measured anyway.
-    """
-
-    out: Path = Path("results/prediction")
-    """Folder for results.json, report.html, plots and clips."""
-    scenes: int = 0
-    """Scenes of the test split; 0 for 60, or 8 with --quick."""
-    far: str = FAR.checkpoint
-    """A checkpoint of ours that looks 40 frames ahead, for the curves."""
-    ocvp_seq: str = "ocvp-seq-small"
-    """Checkpoint of OCVP-Seq: a bundled name, a folder or a hub id."""
-    non_oc: str = "non-oc-small"
-    """Checkpoint of Non-OC."""
-    mage: str = "mage-small"
-    """Checkpoint of MAGE."""
     jedi: str = VJEPA
     """V-JEPA 2 for JEDi: a folder, or a hub id that this machine has fetched before. Its features take about half a
-    minute a film on a CPU. A quick run leaves JEDi out."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.scenes < 0:
-            raise UsageError(f"--scenes must be at least 0, got {self.scenes}")
-
-    @property
-    def sizes(self) -> Sizes:
-        """How much is measured."""
-        sizes = QUICK if self.quick else DEFAULT
-        return Sizes(self.scenes or sizes.scenes, sizes.clips)
+    minute a video on a CPU. A quick run leaves JEDi out."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured: scenes of the test split, and how many best and how many worst cases are shown."""
+    """How much is measured."""
 
-    scenes: int
-    clips: int
-
-
-QUICK = Sizes(scenes=8, clips=4)
-DEFAULT = Sizes(scenes=60, clips=10)
+    scenes: int  # of the test split
+    clips: int  # how many best and how many worst cases are shown
 
 
-def main(
-    args: Args,
-    load: LoadWorldModel | None = None,
-    sizes: Sizes | None = None,
-    baselines: Mapping[str, LoadVideoModel] | None = None,
-    measures: Measures | None = None,
-) -> Results:
-    """Run the study and write its folder.
+QUICK, DEFAULT = Sizes(scenes=8, clips=4), Sizes(scenes=60, clips=10)
 
-    Args:
-        args: the command line.
-        load: makes the world model; by default loads `args.checkpoint`.
-        sizes: how much is measured; by default what `args` ask for.
-        baselines: method -> makes it; by default load the checkpoints that `args` name.
-        measures: what is measured; by default all that this machine can.
 
-    Raises:
-        OSError: if the folder cannot be written, before any work is done.
-        CheckpointError: if there is no such checkpoint, before any work is done.
-    """
-    run, sizes = StudyRun.open("prediction", args, load), sizes or args.sizes
-    named = {FAR.method: args.far, "OCVP-Seq": args.ocvp_seq, "Non-OC": args.non_oc, "MAGE": args.mage}
-    loads = {method: LoadVideo(name) for method, name in named.items()} if baselines is None else baselines
-    contenders, absent = find_contenders(loads)
-    if measures is None:
-        measures = available_measures(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out")
-    pool = run.pool
-    units = [
-        PredictionScene(scene, tuple(contenders), measures, args.seed)
-        for scene in test_scenes(SPLIT, sizes.scenes, args.seed)
+# --- units of work ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PredictionScene:
+    """A unit of work: one scene, imagined by every model and every control."""
+
+    scene: StudyScene
+    models: tuple[Model, ...]
+    measures: Measures
+    seed: int
+
+    def run(self, worker: Worker) -> tuple[FrameScores, ...]:
+        """Imagine, watch, measure: every method in the order of the table; last, what JEDi needs of the truth."""
+        truth, predictions = predict(worker, self.scene, self.models, horizon=FARTHEST, seed=self.seed)
+        scorer = Scorer(truth.frames_T3HW, self.measures, upper=True)
+        return *map(scorer.score, predictions), FrameScores("truth", {}, scorer.real_features())
+
+
+def units(run: Run) -> dict[str, Part]:
+    """The scenes."""
+    scenes, seed = study_scenes(SPLIT, run.sizes.scenes, run.args.seed), run.args.seed
+    work = [PredictionScene(scene, run.models, run.measures, seed) for scene in scenes]
+    return {"scenes": Part(work, 4.0), "clips": Part(seconds=1.4, count=min(2 * run.sizes.clips, len(work)))}
+
+
+def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
+    """The best and the worst scenes, by how ours looks over the whole episode, or as far as it looks."""
+    metric, seed = run.measures.main, run.args.seed
+    means = [float(scores[0].curves[metric][:HORIZON].mean()) for scores in found["scenes"]]
+    # An episode is over before it looks farther than ours.
+    shown = tuple(model for model in run.models if model.key != OURS_40)
+    clips = [
+        PredictionClip(scene, shown, seed, "prediction", f"{METRICS[metric]} {mean:.3f}")
+        for scene, mean in zip(study_scenes(SPLIT, len(means), seed), means, strict=True)
     ]
-    parts = {"scenes": len(units), "pictures": min(2 * sizes.clips, len(units))}
-    outcomes: list[PredictionOutcome] = []
-    with StudyProgress({part: (n, SECONDS[part]) for part, n in parts.items()}) as progress:
-        for outcome in progress.track("scenes", pool.run(units)):
-            outcomes.append(outcome)
-            if len(outcomes) % 4 == 0:
-                progress.show(paper_table(length_rows(outcomes), absent))
-        rows = [*length_rows(outcomes), *jedi_rows(outcomes), *frame_rows(outcomes, measures.metrics)]
-        pictures = choose(outcomes, contenders, measures, args.seed, sizes.clips)
-        clips = list(progress.track("pictures", pool.run(pictures)))
-    seeds = {"slots": [args.seed], "scenes": [unit.scene.seed for unit in units]}
-    results = run.results(rows, headline(rows, measures), seeds, hashes(contenders))
-    report = build_report(results, contenders, absent, measures, *halves(clips), run.command)
-    run.write(report)
-    tables = [paper_table(rows, absent), episode_table(rows, absent), upper_table(rows, absent, measures)]
-    run.close(progress, results, tables, [*(one.text for one in absent), measures.absent])
-    return results
-
-
-def choose(
-    outcomes: Sequence[PredictionOutcome],
-    contenders: Sequence[Contender],
-    measures: Measures,
-    seed: int,
-    count: int,
-) -> list[FilmPicture]:
-    """The best cases and then the worst ones, by how ours looks over the whole episode, or as far as it looks."""
-    metric = measures.main
-    means = [float(outcome.of("ours").curves[metric][: LENGTHS[-1]].mean()) for outcome in outcomes]
     badness = [-mean if metric == "ssim" else mean for mean in means]
-    cases = list(zip(outcomes, means, strict=True))
-    # An episode has 24 frames, so ours is shown once.
-    shown = tuple(contender for contender in contenders if contender.method != FAR.method)
-    pictures = []
-    for best, chosen in zip((True, False), extremes(cases, badness, count), strict=True):
-        for rank, (outcome, mean) in enumerate(chosen, start=1):
-            caption = f"{METRICS[metric]} {mean:.3f}"
-            pictures.append(FilmPicture(outcome.scene, shown, seed, "prediction", rank, best, caption))
-    return pictures
+    return {"clips": extreme_clips(clips, badness, run.sizes.clips)}
 
 
-def headline(rows: Sequence[Row], measures: Measures) -> dict[str, float]:
-    """The figures that are asked for by name: metric, frames, and who, where it is not ours."""
-    found = {(row.method, row.variant, row.metric): row.value for row in rows}
-    figures = {}
-    for metric in (*measures.metrics, "jedi"):
-        for length in LENGTHS:
-            for method, ending in NAMED.items():
-                value = found.get((method, f"{length} frames", metric))
-                if value is not None:
-                    figures[f"{metric}_{length}{ending}"] = round(value, 4)
-    return figures
+# --- rows -------------------------------------------------------------------------------------------------------------
 
+
+def frame_rows(outcomes: Sequence[Sequence[FrameScores]]) -> list[Row]:
+    """Means over the first so many frames, with and without the bottom rows; then every frame alone."""
+    lengths, alone = [], []
+    for scores in zip(*outcomes, strict=True):
+        place = scores[0].method, SPLIT
+        for metric in scores[0].curves:
+            curves_NT = np.stack([one.curves[metric] for one in scores])
+            means = {n: curves_NT[:, :n].mean(axis=1) for n in LENGTHS if n <= curves_NT.shape[1]}
+            lengths += [mean_row(*place, f"{n} frames", metric, means_N) for n, means_N in means.items()]
+            if not metric.endswith(UPPER):
+                alone += [mean_row(*place, f"frame {t}", metric, its) for t, its in enumerate(curves_NT.T, 1)]
+    return [*lengths, *alone]
+
+
+def jedi_rows(outcomes: Sequence[Sequence[FrameScores]]) -> list[Row]:
+    """JEDi at each length; none where its features were not computed."""
+    made = []
+    for scores in zip(*(outcome[:-1] for outcome in outcomes), strict=True):
+        for length in scores[0].features:
+            imagined_ND = np.stack([one.features[length] for one in scores])
+            distance = jedi(imagined_ND, np.stack([outcome[-1].features[length] for outcome in outcomes]))
+            made.append(interval_row(scores[0].method, SPLIT, f"{length} frames", "jedi", distance))
+    return made
+
+
+def headline(run: Run) -> dict[str, Key]:
+    """Every metric of whole frames at every length, of ours, the baselines and the first frame repeated."""
+    return {
+        f"{metric}_{length}{METHODS[method].ending}": (method, SPLIT, f"{length} frames", metric)
+        for metric in (*run.measures.metrics, "jedi")
+        for length in LENGTHS
+        for method in ("ours", *BASELINES, "copy frame")
+    }
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+
+def _columns(metrics: Sequence[str], lengths: Sequence[int], view: str = "") -> list[Column]:
+    return [
+        Column(f"{METRICS[m]} {n}", SPLIT, f"{n} frames", m + view, 2 if m in ("psnr", "jedi") else 3)
+        for n in lengths
+        for m in metrics
+    ]
+
+
+SHOWN = ("ssim", "lpips", "st_lpips", "jedi")
+PAPER_TABLE = TableSpec(
+    "9 and 19 frames",
+    _columns(SHOWN, LENGTHS[:2]),
+    [*LINES[:-3], Line(key="SEER", kind="baseline", note=SEER), *LINES[-3:]],
+    "Means over the first 9 and the first 19 imagined frames. SSIM: higher is better; the others: lower.",
+)
+EPISODE_TABLE = TableSpec(
+    "Whole episodes, and PSNR",
+    [*_columns(["psnr"], LENGTHS), *_columns(SHOWN, [HORIZON])],
+    LINES,
+    f"PSNR in dB, higher is better, averaged frame by frame; equal frames count as {PSNR_CAP:g} dB. "
+    f"An episode has {HORIZON} frames after the first.",
+)
+UPPER_TABLE = TableSpec(
+    "Without the bottom rows", _columns(SHOWN[:3], LENGTHS, UPPER), LINES,
+    f"The same without the lowest {BOTTOM_ROWS} rows of pixels. The robot stands beyond the upper edge and hardly ever "
+    "reaches down there. So these rows are mostly still table, which is easy.",
+)  # fmt: skip
+
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    figures, metric = list(results.rows), run.measures.main
+    paper, *more = run.tables(figures)
+    by_length = TableSpec("", _columns([metric], LENGTHS), LINES)
+    models = [("ours", run.checkpoint.name, run.world_model.longest_horizon)]
+    models += [(one.key, one.checkpoint, one.longest) for one in run.models]
+    ahead = "; ".join(f"{key} ({name}): {longest or 'any number'}" for key, name, longest in models)
+    best, worst = best_and_worst(found["clips"])
+    cases = f"By {METRICS[metric]} of ours over the whole episode. Below the pictures: the slots' masks beside the "
+    cases += "simulator's segmentation, one colour a thing; for models without slots, what our parser sees."
+    return [
+        Section(
+            "As in the paper's table",
+            "Every model sees the first frame of a held-out scene and the sentence, and imagines; the expert carries "
+            "the sentence out in the simulator; frames are compared one by one. The paper's figures come from other "
+            f"pictures: compare orders and distances, not heights. {TRAINED_LITTLE} What a dash stands for is said in "
+            "the last section.",
+            [paper, plot_table("lengths.png", by_length, figures, label=_label(metric), limits=None), *more],
+        ),
+        Section(
+            "Over time",
+            f"Curves go to {FARTHEST} frames for models that can look as far. An episode is over after {HORIZON}; from "
+            "then on the real video is its last frame, in which the arm rests: in the simulator, frames after the end "
+            "differ from it by less than .2 of 255 grey levels in the mean. Frames that each model imagines at once: "
+            f"{ahead}.",
+            [_curves(figures, metric) for metric in run.measures.metrics],
+        ),
+        Section("The best cases", cases, [Clips(best)]),
+        Section("The worst cases", cases, [Clips(worst)]),
+        Section("What is absent", " ".join([*run.remarks, f"SEER is absent: {SEER}."])),
+    ]
+
+
+def _label(metric: str) -> str:
+    better = "higher" if metric in ("psnr", "ssim") else "lower"
+    return f"{METRICS[metric]}{' in dB' if metric == 'psnr' else ''}, {better} is better"
+
+
+def _curves(figures: Sequence[Row], metric: str) -> Figure:
+    over_time = [Column("", SPLIT, f"frame {t}", metric) for t in range(1, FARTHEST + 1)]
+    spec = TableSpec("", over_time, LINES, "Bands: 95 % intervals over scenes.")
+    return plot_curves(f"{metric}.png", spec, figures, label=_label(metric))
+
+
+def cards(run: Run, results: Results) -> list[CardSpec]:
+    """Ours at each length beside MAGE and the first frame repeated, and what it could reach at best and at worst."""
+
+    def card(method: str, column: Column) -> CardSpec:
+        rivals = [(m, results.find(m, column.variant, column.metric)) for m in ("MAGE", "copy frame")]
+        compare = ", ".join(f"{m} {row.value:.{column.digits}f}" for m, row in rivals if row is not None)
+        return CardSpec(f"{column.title} frames, {method}", METHODS[method], column, compare, bar=False)
+
+    made = [card("ours", column) for column in _columns(("ssim", *run.measures.perceptual[-1:]), LENGTHS)]
+    (whole,) = _columns([run.measures.main], [HORIZON])
+    return [*made, card("true frames", whole), card("wrong text", whole)]
+
+
+STUDY = Study(
+    name="prediction",
+    title="Prediction quality",
+    question="One frame and a sentence: how much do the imagined frames look like what then happens?",
+    args=Args,
+    sizes=lambda args: replace(s := QUICK if args.quick else DEFAULT, scenes=args.scenes or s.scenes),
+    methods=IMAGINING,
+    measures=lambda args: available(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out"),
+    units=units,
+    cases=cases,
+    rows=lambda run, found: [*frame_rows(found["scenes"]), *jedi_rows(found["scenes"])],
+    tables=(PAPER_TABLE, EPISODE_TABLE, UPPER_TABLE),
+    page=page,
+    cards=cards,
+    headline=headline,
+    first=("ssim_9", "ssim_9_mage", "st_lpips_9", "st_lpips_9_mage"),
+)
 
 if __name__ == "__main__":
-    start(main, Args)
+    start(STUDY)

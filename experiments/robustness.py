@@ -171,13 +171,12 @@ def imagined_clips(
         for outcome, mean in zip(shifted, means, strict=True)
     ]
 
-    def clip(case: tuple[RobustOutcome, float], rank: int, best: bool) -> PredictionClip:
-        outcome, mean = case
+    clips = []
+    for outcome, mean in zip(shifted, means, strict=True):
         caption = f"{SPLITS[outcome.scene.split]}; {METRICS[metric]} {mean:.3f}"
         good = outcome.success.get("ours")
-        return PredictionClip(outcome.scene, tuple(models), seed, "robustness", rank, best, caption, good)
-
-    return extreme_clips(list(zip(shifted, means, strict=True)), badness, count, clip)
+        clips.append(PredictionClip(outcome.scene, tuple(models), seed, "robustness", caption, good))
+    return extreme_clips(clips, badness, count)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +16,6 @@ from experiments.study.pool import Worker
 from experiments.study.predictions import predict, slots_of, to_uint8
 from experiments.study.scenes import StudyScene, sample_scene
 
-T = TypeVar("T")
-
 
 @dataclass(frozen=True)
 class PredictionClip:
@@ -28,12 +25,17 @@ class PredictionClip:
     models: tuple[Model, ...]  # the others
     seed: int  # of the slots
     group: str  # first part of the file's name
-    rank: int  # its place among the best or the worst
-    best: bool  # among which of the two
     caption: str  # what it was ranked by
     good: bool | None = None  # whether that is good in itself; None where only the rank is known
     variant: int = 0  # which of the scene's instructions
     variants: int = 0  # how many it has beside its own
+    best: bool = True  # whether it is among the best or the worst
+    rank: int = 1  # its place among those
+
+    @property
+    def place(self) -> str:
+        """As `best 1`."""
+        return f"{'best' if self.best else 'worst'} {self.rank}"
 
     def run(self, worker: Worker) -> Clip:
         """Imagine and play it once more."""
@@ -49,21 +51,16 @@ class PredictionClip:
             labels_THW = labels_of(rollout)[0]
             colors = slot_colors(labels_THW[0], info["segmentation"], rollout.slots.shape[2], objects)
             masks.append(paint(labels_THW, colors))
-        # Pictures of many models are noisy and do not pack well; the page enlarges them itself.
-        scale = 2 if len(predictions) < 3 else 1
-        kind = "best" if self.best else "worst"
-        badge = f"{kind} {self.rank}"
-        if self.good is not None:
-            badge += ": success" if self.good else ": failure"
+        frames = [truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)]
+        verdict = "" if self.good is None else ": success" if self.good else ": failure"
         return Clip(
-            name=f"{self.group}-{kind}-{self.rank}.gif",
-            gif=gif(
-                [[truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)], masks], scale=scale
-            ),
+            name=f"{self.group}-{self.place.replace(' ', '-')}.gif",
+            # Pictures of many models are noisy and do not pack well; the page enlarges them itself.
+            gif=gif([frames, masks], scale=2 if len(predictions) < 3 else 1),
             panels=("real", *(one.method for one in predictions)),
             title=truth.text,
             caption=f"{self.caption}; seed {self.scene.seed}",
-            badge=badge,
+            badge=self.place + verdict,
             tone=tone(self.good),
         )
 
@@ -82,14 +79,14 @@ class EpisodeClip:
         sampled = sample_scene(worker.environment(episode.scene), episode.scene, episode.variants)
         result = episode.pursue(worker, sampled)
         imagined = [to_uint8(attempt.plan.rollout.frames[0]) for attempt in result.attempts]
-        steps = f"{result.steps} pick-and-place" + ("s" if result.steps != 1 else "")
+        steps = f"{result.steps} pick-and-place{'s' if result.steps != 1 else ''}"
+        error = f"; {result.error}" if result.error else ""
         return Clip(
             name=f"closed-loop-{self.rank}.gif",
             gif=gif([[np.concatenate(imagined or [result.frames[:1]]), result.frames]]),
             panels=("the plan, imagined", "what happened"),
             title=self.outcome.text,
-            caption=f"{self.column}, seed {episode.scene.seed}; {steps}"
-            + (f"; {result.error}" if result.error else ""),
+            caption=f"{self.column}, seed {episode.scene.seed}; {steps}{error}",
             badge="success" if result.success else "failure",
             tone=tone(result.success),
         )
@@ -105,10 +102,7 @@ def episode_clips(
 ) -> list[EpisodeClip]:
     """Up to `count` failures of ours, and successes with the longest goals: `2 * count` in all.
 
-    Args:
-        outcomes: of all methods.
-        column_of: title of the column that an episode stands in.
-        count: of failures.
+    `column_of` gives the title of the column that an episode stands in.
     """
     ours = [o for o in outcomes if o.episode.method == "ours"]
     failures = [o for o in ours if not o.success][:count]
@@ -117,25 +111,20 @@ def episode_clips(
     return [EpisodeClip(o, column_of(o.episode), rank) for rank, o in enumerate(chosen + failures, start=1)]
 
 
-def extremes(cases: Sequence[T], badness: Sequence[float], count: int) -> tuple[list[T], list[T]]:
-    """The `count` best cases and the `count` worst ones, most extreme first; no case is both.
-
-    Of an odd number of cases too few for all, the best have one more.
-    """
-    order = [int(i) for i in np.argsort(np.asarray(badness), kind="stable")]
-    worst = min(count, len(cases) // 2)
-    best = min(count, len(cases) - worst)
-    return [cases[i] for i in order[:best]], [cases[i] for i in reversed(order[len(order) - worst :])]
-
-
 def extreme_clips(
-    cases: Sequence[T], badness: Sequence[float], count: int, make: Callable[[T, int, bool], PredictionClip]
+    clips: Sequence[PredictionClip], badness: Sequence[float], count: int
 ) -> list[PredictionClip]:
-    """The best cases and then the worst ones as clips. `make` gets a case, its rank from 1, and whether it is best."""
+    """The `count` best and then the `count` worst, each with its rank, most extreme first; none is both.
+
+    Of an odd number of clips too few for all, the best have one more.
+    """
+    order = np.argsort(np.asarray(badness), kind="stable").tolist()
+    worst = min(count, len(clips) // 2)
+    best = min(count, len(clips) - worst)
     return [
-        make(case, rank, best)
-        for best, chosen in zip((True, False), extremes(cases, badness, count), strict=True)
-        for rank, case in enumerate(chosen, start=1)
+        replace(clips[i], best=good, rank=rank)
+        for good, chosen in ((True, order[:best]), (False, order[::-1][:worst]))
+        for rank, i in enumerate(chosen, start=1)
     ]
 
 

@@ -20,9 +20,9 @@ from textocvp.metrics.perceptual import MetricUnavailable, PerceptualDistance, l
 BOTTOM_ROWS = 10
 #: Equal frames have an infinite PSNR, which no mean survives. 60 dB is a mean error of a quarter of a grey level.
 PSNR_CAP = 60.0
-#: Metric -> name in tables. Lower is better for the distances.
+#: Metric -> name in tables. Lower is better for the distances, which JEDi is one of.
 PERCEPTUAL = {"lpips": "LPIPS", "st_lpips": "ST-LPIPS"}
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", **PERCEPTUAL}
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", **PERCEPTUAL, "jedi": "JEDi"}
 UPPER = "_without_bottom_rows"
 
 
@@ -64,7 +64,7 @@ class Measures:
     @property
     def absent(self) -> str:
         """Sentences for a report; empty if nothing is absent."""
-        return " ".join(f"{METRICS.get(name, 'JEDi')} is absent: {reason}." for name, reason in self.reasons)
+        return " ".join(f"{METRICS[name]} is absent: {reason}." for name, reason in self.reasons)
 
 
 def available_measures(
@@ -75,22 +75,15 @@ def available_measures(
     Args:
         jedi: the V-JEPA that is wanted, or None. without_jedi: why none is.
     """
-    reasons, found = [], []
-    for metric in PERCEPTUAL:
+    reasons = {"jedi": without_jedi} if jedi is None and without_jedi else {}
+    for metric in (*PERCEPTUAL, *(["jedi"] if jedi else [])):
         try:
-            perceptual(metric)
-            found.append(metric)
+            _ = video_features(jedi) if jedi and metric == "jedi" else perceptual(metric)
         except MetricUnavailable as error:
-            reasons.append((metric, str(error)))
-    if jedi is not None:
-        try:
-            video_features(jedi)
-        except MetricUnavailable as error:
-            reasons.append(("jedi", str(error)))
-            jedi = None
-    elif without_jedi:
-        reasons.append(("jedi", without_jedi))
-    return Measures(tuple(found), jedi, jedi_lengths, tuple(reasons))
+            reasons[metric] = str(error)
+    found = tuple(metric for metric in PERCEPTUAL if metric not in reasons)
+    order = [(metric, reasons[metric]) for metric in METRICS if metric in reasons]
+    return Measures(found, None if "jedi" in reasons else jedi, jedi_lengths, tuple(order))
 
 
 @dataclass(frozen=True, eq=False)

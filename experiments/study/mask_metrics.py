@@ -48,36 +48,26 @@ def score_masks(labels_THW: np.ndarray, truth_THW: np.ndarray, moved: int) -> Ma
     things = [int(label) for label in np.unique(truth_THW) if label != BACKGROUND]
     first = object_ious(labels_THW[0], truth_THW[0], things)
     held = dict(zip(first.ids.tolist(), first.slots.tolist(), strict=True))
-    columns = []
+    frames = []
     for labels, truth in zip(labels_THW, truth_THW, strict=True):
         objects = object_ious(labels, truth, [label for label in things if label != ARM])
         matched = object_ious(labels, truth, things)
         of = dict(zip(matched.ids.tolist(), matched.ious.tolist(), strict=True))
         block, arm = of.get(moved, np.nan), of.get(ARM, np.nan)
         kept = _held_ious(labels, truth, held)
-        columns.append(
-            (
-                _mean(objects.ious),
-                _mean([block, arm]),
-                block,
-                arm,
-                _mean(objects.ious[objects.ids != moved]),
-                _mean([iou for i, iou in kept.items() if i != ARM]),
-                _mean([kept.get(moved, np.nan), kept.get(ARM, np.nan)]),
-                foreground_ari(labels, truth),
-            )
-        )
-    return MaskScores(*np.array(columns, dtype=np.float64).T)
+        everything, still = _mean(objects.ious), _mean(objects.ious[objects.ids != moved])
+        kept_objects = _mean([iou for i, iou in kept.items() if i != ARM])
+        kept_moving = _mean([kept.get(moved, np.nan), kept.get(ARM, np.nan)])
+        moving, ari = _mean([block, arm]), foreground_ari(labels, truth)
+        frames.append((everything, moving, block, arm, still, kept_objects, kept_moving, ari))
+    return MaskScores(*np.array(frames, dtype=np.float64).T)
 
 
 def _held_ious(labels: np.ndarray, truth: np.ndarray, held: Mapping[int, int]) -> dict[int, float]:
     """Overlap of each thing that is seen with the slot it has been given; 0 if that slot shows nothing."""
     ious, slots, ids = overlaps(labels, truth, list(held))
-    found = {}
-    for column, i in enumerate(ids.tolist()):
-        row = np.flatnonzero(slots == held[i])
-        found[i] = float(ious[row[0], column]) if len(row) else 0.0
-    return found
+    # Each slot has one row at most, and one that shows nothing has none.
+    return {i: float(ious[slots == held[i], column].sum()) for column, i in enumerate(ids.tolist())}
 
 
 def _mean(values: object) -> float:

@@ -5,6 +5,7 @@ To compare another baseline or another planner, add one entry to `METHODS`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,11 @@ class Method(Line):
     def acts(self) -> bool:
         """Whether it acts in the closed loop."""
         return self.expert or self.plan is not None
+
+    @property
+    def ending(self) -> str:
+        """Of the names of its headline figures: `_copy_frame`; empty for ours."""
+        return "" if self.key == "ours" else "_" + re.sub(r"\W", "_", self.key.lower())
 
 
 def _best(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
@@ -203,6 +209,7 @@ BASELINES = tuple(key for key, method in METHODS.items() if method.kind == "base
 """The models that ours is compared with, in the order of the tables."""
 PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)
 """Who acts in the closed loop."""
+OURS_40 = "ours, 40 frames"
 TRAINED_LITTLE = (
     "The bundled baselines are small and were trained for minutes on two cores, as their cards say: none of them was "
     "trained to the end."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -14,6 +14,8 @@ from experiments.study.methods import Model
 from experiments.study.pool import Worker
 from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene, wrong_text
 from textocvp import Rollout, WorldModel
+
+Video = TypeVar("Video", np.ndarray, Tensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,21 +82,14 @@ def predict(
     played = play_expert(env, sampled, variant)
     # What comes after the end of an episode is its last frame, because the arm has come to rest: in the simulator 16
     # further frames differ from it by less than .2 of 255 grey levels in the mean. A test checks it.
-    truth = GroundTruth(
-        sampled,
-        text,
-        wrong,
-        hold_last(played.frames, horizon + 1),
-        hold_last(played.segmentations, horizon + 1),
-    )
+    frames, segmentations = (hold_last(its, horizon + 1) for its in (played.frames, played.segmentations))
+    truth = GroundTruth(sampled, text, wrong, frames, segmentations)
     if controls:
         parsed = ours.parse(played.frames, seed=seed)
-        last = torch.arange(horizon + 1).clamp(max=len(played.frames) - 1)
-        still = truth.frames_T3HW[:1].expand(horizon + 1, -1, -1, -1)
         predictions += [
-            Prediction("true frames", parsed.frames[0][last], parsed),
+            Prediction("true frames", hold_last(parsed.frames[0], horizon + 1), parsed),
             Prediction("wrong text", other.frames[0], other),
-            Prediction("copy frame", still),
+            Prediction("copy frame", hold_last(truth.frames_T3HW[:1], horizon + 1)),
         ]
     return truth, predictions
 
@@ -104,8 +99,7 @@ def _predict_one(
 ) -> Prediction:
     made, ahead = worker.model(model.load), _ahead(model.longest, horizon)
     if not model.slots:
-        frames_1T3HW = made.imagine(seen, [text], horizon=ahead, seed=seed)
-        return Prediction(model.key, frames_1T3HW[0].float().cpu())
+        return Prediction(model.key, made.imagine(seen, [text], horizon=ahead, seed=seed)[0].float().cpu())
     rollout = cast(WorldModel, made).rollout(seen, [text], horizon=ahead, seed=seed)
     return Prediction(model.key, rollout.frames[0], rollout)
 
@@ -122,7 +116,7 @@ def to_uint8(frames_T3HW: Tensor) -> np.ndarray:
     return (frames_T3HW * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
 
 
-def hold_last(frames: np.ndarray, count: int) -> np.ndarray:
+def hold_last(frames: Video, count: int) -> Video:
     """The first so many frames; where there are fewer, the last one stands still."""
     return frames[np.minimum(np.arange(count), len(frames) - 1)]
 

@@ -2,18 +2,19 @@
 
 import html
 import json
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.objects import Args, Sizes, main, method_rows
-from experiments.protocol import contenders
-from experiments.protocol.object_gallery import choose_objects
-from experiments.protocol.object_scenes import MaskScores, ObjectOutcome, ObjectScene, score_masks
-from experiments.protocol.scenes import draw, test_scenes, wrong_text
-from experiments.protocol.workers import Worker
+from experiments.objects import STUDY, ObjectScene, Sizes, cases, method_rows
+from experiments.study.mask_metrics import MaskScores, score_masks
+from experiments.study.methods import METHODS, OURS_40, Model, find_models
+from experiments.study.pool import LoadCheckpoint, Worker
+from experiments.study.run import Run, StudyArgs, run
+from experiments.study.scenes import sample_scene, study_scenes, wrong_text
 from planning import Instruction
 from tests.experiments.foresight import LoadForesight
 from tests.experiments.oracle import LoadOracle
@@ -72,11 +73,10 @@ def test_masks_must_fit_the_segmentation() -> None:
 
 
 @lru_cache
-def outcome(kind: str, ahead: int | None = 24) -> ObjectOutcome:
-    (scene,) = test_scenes("test", 1, 0)
-    return ObjectScene(scene, 0, (("OCVP-Seq", LoadForesight("copies")),)).run(
-        Worker(LoadForesight(kind, ahead)())
-    )  # type: ignore[arg-type]
+def outcome(kind: str, ahead: int | None = 24) -> Mapping[str, MaskScores]:
+    (scene,) = study_scenes("test", 1, 0)
+    copies = Model("OCVP-Seq", LoadForesight("copies"), True, "copies", "1" * 64, 24)
+    return ObjectScene(scene, (copies,), 0).run(Worker(LoadForesight(kind, ahead)()))  # type: ignore[arg-type]
 
 
 def assert_same(a: MaskScores, b: MaskScores) -> None:
@@ -85,18 +85,18 @@ def assert_same(a: MaskScores, b: MaskScores) -> None:
 
 
 def test_who_sees_the_future_reaches_the_ceiling_and_who_copies_is_copy_seed() -> None:
-    sees = outcome("sees").scores
+    sees = outcome("sees")
     assert_same(sees["ours"], sees["true frames"])
-    assert_same(sees["wrong text"], sees["copy seed"])  # told something else, it imagines a still picture
+    assert_same(sees["wrong text"], sees["copy seed"])  # for another text it imagines a still picture
     assert_same(sees["OCVP-Seq"], sees["copy seed"])  # here a double that copies
     assert np.nanmean(sees["ours"].moving[1:]) > np.nanmean(sees["copy seed"].moving[1:]) + 0.2
-    copies = outcome("copies").scores
+    copies = outcome("copies")
     assert_same(copies["ours"], copies["copy seed"])
     assert len(copies["ours"].iou) == 25
 
 
 def test_shuffled_slots_keep_their_overlap_and_lose_their_names() -> None:
-    scores = outcome("shuffles").scores
+    scores = outcome("shuffles")
     np.testing.assert_array_equal(scores["ours"].iou, scores["true frames"].iou)
     assert scores["ours"].kept[0] == scores["true frames"].kept[0] > 0.5
     assert scores["ours"].kept[1:].max() < 0.2 < scores["true frames"].kept[1:].min()
@@ -104,46 +104,46 @@ def test_shuffled_slots_keep_their_overlap_and_lose_their_names() -> None:
 
 def test_a_model_that_can_look_further_is_measured_further() -> None:
     far, near = outcome("sees", None), outcome("sees", 10)
-    assert {len(far.scores["ours"].iou), len(far.scores["true frames"].iou)} == {41}
+    assert {len(far["ours"].iou), len(far["true frames"].iou)} == {41}
     rows = {(r.method, r.variant) for r in method_rows([far], ["iou"])}
     assert ("ours", "frames 1-40") in rows and ("OCVP-Seq", "frame 40") not in rows
     assert {r.variant for r in method_rows([near], ["iou"]) if r.method == "ours"} == {
         "frames 1-9",
         "frame 9",
     }
-    assert near.scores["copy seed"].iou.shape == (25,)  # as long as the longest of all methods
+    assert near["copy seed"].iou.shape == (25,)  # as long as the longest of all methods
     # The scene rests in its last frame after the episode.
-    assert len(set(far.scores["true frames"].iou[far.frames - 1 :].tolist())) == 1
+    assert len(set(far["true frames"].iou[24:].tolist())) == 1
 
 
 def test_a_wrong_text_names_something_else() -> None:
     worker = Worker(LoadOracle()())
     for split in ("test", "controllability"):
-        for scene in test_scenes(split, 6, 0):
-            drawn = draw(worker.environment(scene), scene)
-            own, other = Instruction.parse(drawn.texts[0]), Instruction.parse(wrong_text(drawn))
-            kinds = [item["kind"] for item in drawn.info["objects"]]
-            assert (own.block != other.block) == (kinds.count("block") > 1)
-            assert (own.bowl != other.bowl) == (kinds.count("bowl") > 1)
-            assert {(item["kind"], item["color"]) for item in drawn.info["objects"]} >= {
-                ("block", other.block),
-                ("bowl", other.bowl),
-            }
-            assert wrong_text(drawn) == wrong_text(drawn)
+        for scene in study_scenes(split, 6, 0):
+            sampled = sample_scene(worker.environment(scene), scene)
+            own, other = Instruction.parse(sampled.texts[0]), Instruction.parse(wrong_text(sampled))
+            objects = [(item["kind"], item["color"]) for item in sampled.info["objects"]]
+            for mine, named in zip(own.things, other.things, strict=True):
+                others = [kind for kind, _ in objects].count(mine.kind) > 1
+                assert (mine != named) == others and (named.kind, named.color) in objects
+            assert wrong_text(sampled) == wrong_text(sampled)
 
 
-def test_the_worst_and_the_best_are_those_with_the_least_and_most_overlap() -> None:
-    outcomes = []
-    for i, value in enumerate((0.5, 0.1, 0.9)):
-        scores = MaskScores(**{name: np.full(25, value) for name in FIELDS})
-        outcomes.append(ObjectOutcome(test_scenes("test", 3, 0)[i], "", "", 25, {"ours": scores}))
-    chosen = choose_objects(outcomes, 0, clips=2, apart=1)
-    assert [(p.best, p.rank, round(p.moving, 2), p.apart) for p in chosen] == [
-        (True, 1, 0.9, True),
-        (True, 2, 0.5, False),
-        (False, 1, 0.1, True),
-        (False, 2, 0.5, False),
+def test_the_worst_and_the_best_are_those_with_the_least_and_most_overlap(tmp_path: Path) -> None:
+    this = Run(
+        STUDY, StudyArgs(out=tmp_path), load=LoadOracle(), sizes=Sizes(scenes=4, clips=2, apart=1), loads={}
+    )
+    values = (0.5, 0.1, 0.9, 0.2)
+    outcomes = [{"ours": MaskScores(**{name: np.full(25, value) for name in FIELDS})} for value in values]
+    chosen = cases(this, {"scenes": outcomes})
+    scenes = study_scenes("test", 4, 0)
+    assert [(p.best, p.rank, p.caption[-4:], scenes.index(p.scene)) for p in chosen["clips"]] == [
+        (True, 1, "0.90", 2),
+        (True, 2, "0.50", 0),
+        (False, 1, "0.10", 1),
+        (False, 2, "0.20", 3),
     ]
+    assert [strip.clip.place for strip in chosen["slots apart"]] == ["best 1", "worst 1"]
 
 
 def not_there(name: str) -> None:
@@ -154,9 +154,9 @@ def not_there(name: str) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contenders, "load_video_model", not_there)
-        args = Args(out=out, quick=True, workers=1)
-        main(args, LoadForesight("sees"), Sizes(scenes=1, clips=1, apart=1))
+        patch.setattr("experiments.study.pool.load_model", not_there)
+        args = StudyArgs(out=out, quick=True, workers=1)
+        run(STUDY, args, load=LoadForesight("sees"), sizes=Sizes(scenes=2, clips=1, apart=1))
     return out
 
 
@@ -168,16 +168,15 @@ def test_the_figures_are_there_with_intervals(folder: Path) -> None:
     )
     assert head["iou_wrong_text_24"] == head["iou_copy_seed_24"] and 0 < head["ari_19"] <= 1
     assert not any("ocvp" in name for name in head)
-    assert data["study"] == "objects" and data["quick"] is True and len(data["seeds"]["scenes, test"]) == 1
+    assert data["study"] == "objects" and data["quick"] is True and len(data["seeds"]["scenes, test"]) == 2
     zero = [r for r in data["rows"] if r["method"] == "ours minus true frames"]
-    assert zero and all((r["value"], r["low"], r["high"], r["n"]) == (0, 0, 0, 1) for r in zero)
+    assert zero and all((r["value"], r["low"], r["high"], r["n"]) == (0, 0, 0, 2) for r in zero)
 
 
 def test_the_page_shows_what_is_absent_and_every_slot(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    assert contenders.BASELINES[0].method == "OCVP-Seq"
-    for one in (contenders.BASELINES[0], contenders.FAR):
-        assert f"{one.method} is absent: not trained: `{one.train}`" in html.unescape(page)
+    for key in ("OCVP-Seq", OURS_40):
+        assert f"{key} is absent: not trained: `{METHODS[key].train}`" in html.unescape(page)
     assert "Quick run" in page
     assert "paper, Copy-Seed" in page and "0.525" in page
     names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}
@@ -186,13 +185,17 @@ def test_the_page_shows_what_is_absent_and_every_slot(folder: Path) -> None:
 
 
 def test_an_unknown_baseline_is_an_early_error(tmp_path: Path) -> None:
-    for named in ({"ocvp_seq": "no-such-model"}, {"far": "no-such-model"}):
+    for key in ("OCVP-Seq", OURS_40):
+        args = StudyArgs(out=tmp_path / "r", model=(f"{key}=no-such-model",))
         with pytest.raises(CheckpointError, match="no-such-model"):
-            main(Args(out=tmp_path / "r", **named), LoadForesight("sees"))  # type: ignore[arg-type]
+            run(STUDY, args, load=LoadForesight("sees"))
     assert list((tmp_path / "r").iterdir()) == []
 
 
 def test_the_shipped_model_goes_on_with_the_one_for_40_frames() -> None:
-    loads, _ = Args().others()
-    assert loads[contenders.FAR.method]().longest_horizon == 40
-    assert loads["OCVP-Seq"]().checkpoint.name == "ocvp-seq-small"
+    found, _ = find_models(
+        {key: LoadCheckpoint(METHODS[key].model) for key in STUDY.methods if METHODS[key].model}
+    )
+    far, other = found
+    assert far.key == OURS_40 and far.longest == 40
+    assert other.key == "OCVP-Seq" and other.checkpoint == "ocvp-seq-small"

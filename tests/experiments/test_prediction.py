@@ -7,28 +7,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.prediction import Args, Sizes, main
-from experiments.protocol.arguments import UsageError
-from experiments.protocol.frame_scores import FrameScores, Measures, available_measures
-from experiments.protocol.prediction import PredictionOutcome, PredictionScene, jedi_rows, length_rows
-from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import Worker
-from experiments.reporting import Results
+from experiments.prediction import STUDY, Args, PredictionScene, Sizes, frame_rows, jedi_rows
+from experiments.report.results import Results
+from experiments.study.frame_metrics import FrameScores, Measures, available_measures
+from experiments.study.pool import Worker
+from experiments.study.run import UsageError, run
+from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
 from tests.experiments.still import LoadStill
 from textocvp.metrics.jedi import jedi
 
-MEASURES = Measures(("st_lpips",), None, (), (("lpips", "no weights here"), ("jedi", "none there")))
+MEASURES = Measures(("st_lpips",), reasons=(("lpips", "no weights here"), ("jedi", "none there")))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
-    main(
+    run(
+        STUDY,
         Args(out=out, quick=True, workers=1),
         load=LoadOracle(),
         sizes=Sizes(scenes=2, clips=1),
-        baselines={"MAGE": LoadStill(12)},
+        loads={"MAGE": LoadStill(12)},
         measures=MEASURES,
     )
     return out
@@ -50,7 +50,7 @@ def test_results_have_every_method_length_and_view(folder: Path) -> None:
     assert "ssim_9_mage" in results.headline and "ssim_19_mage" not in results.headline
     assert results.quick and results.study == "prediction"
     assert results.versions["checkpoint of MAGE"] == "1" * 64
-    # The double without movement and the control without movement are one film.
+    # The double without movement and the control without movement are equal.
     mage, copy = (results.find(m, "9 frames", "psnr") for m in ("MAGE", "copy frame"))
     assert mage is not None and copy is not None and mage.value == pytest.approx(copy.value)
 
@@ -72,37 +72,32 @@ def test_the_page_says_what_is_absent_and_shows_both_ends(folder: Path) -> None:
 
 def test_a_unit_of_work_depends_on_nothing_but_itself() -> None:
     """In whatever order units are run, and beside whatever others, figures stay the same."""
-    bare = Measures((), None, (), ())
-    first, second = (PredictionScene(scene, (), bare, 0) for scene in test_scenes("test", 2, 3))
+    first, second = (PredictionScene(scene, (), Measures(), 0) for scene in study_scenes("test", 2, 3))
     worker, other = Worker(LoadOracle()()), Worker(LoadOracle()())
     alone = second.run(other)
     first.run(worker)
     after = second.run(worker)
-    assert alone.text == after.text and alone.wrong_text == after.wrong_text
-    for a, b in zip(alone.scores, after.scores, strict=True):
+    for a, b in zip(alone, after, strict=True):
         assert a.method == b.method and all(np.array_equal(a.curves[m], b.curves[m]) for m in a.curves)
 
 
 def test_jedi_is_taken_over_scenes() -> None:
     rng = np.random.default_rng(0)
-    scenes = test_scenes("test", 6, 0)
     real, imagined = rng.normal(size=(6, 4)), rng.normal(size=(6, 4))
     outcomes = [
-        PredictionOutcome(
-            scene,
-            "",
-            "",
-            (FrameScores("ours", {"ssim": np.full(10, i / 10)}, {9: imagined[i]}),),
-            {9: real[i]},
+        (
+            FrameScores("ours", {"ssim": np.full(10, i / 10)}, {9: imagined[i]}),
+            FrameScores("truth", {}, {9: real[i]}),
         )
-        for i, scene in enumerate(scenes)
+        for i in range(6)
     ]
     (row,) = jedi_rows(outcomes)
     expected = jedi(imagined, real)
     assert (row.method, row.variant, row.metric, row.n) == ("ours", "9 frames", "jedi", 6)
     assert (row.value, row.low, row.high) == (expected.value, expected.low, expected.high)
-    (row,) = length_rows(outcomes)  # no film has 19 frames
-    assert row.variant == "9 frames" and row.value == pytest.approx(0.25)
+    mean, *alone = frame_rows(outcomes)  # no prediction has 19 frames
+    assert mean.variant == "9 frames" and mean.value == pytest.approx(0.25)
+    assert [row.variant for row in alone] == [f"frame {t}" for t in range(1, 11)]
 
 
 def test_what_cannot_be_measured_has_a_reason(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from envs import Expert
-from experiments.study.clips import PredictionClip, extremes
+from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.frame_metrics import BOTTOM_ROWS, PSNR_CAP, UPPER, Measures, Scorer
 from experiments.study.methods import METHODS, Model, find_models
 from experiments.study.pool import LoadCheckpoint, Worker
@@ -113,16 +113,26 @@ def test_a_model_without_slots_is_looked_at_by_our_parser(worker: Worker, predic
 
 def test_a_clip_shows_everybody_above_their_masks(worker: Worker) -> None:
     (scene,) = study_scenes("test", 1, 0)
-    clip = PredictionClip(scene, (), 0, "prediction", 2, False, "SSIM 0.5").run(worker)
+    clip = PredictionClip(scene, (), 0, "prediction", "SSIM 0.5", best=False, rank=2).run(worker)
     assert clip.panels == ("real", "ours") and clip.name == "prediction-worst-2.gif"
     assert clip.badge == "worst 2" and clip.caption == f"SSIM 0.5; seed {scene.seed}"
     assert clip.gif[:6] == b"GIF89a"
 
 
-def test_no_case_is_among_the_best_and_the_worst() -> None:
-    assert extremes("abcde", [3, 1, 5, 2, 4], 10) == (["b", "d", "a"], ["c", "e"])
-    assert extremes("a", [3], 10) == (["a"], [])
-    assert extremes("abcde", [3, 1, 5, 2, 4], 1) == (["b"], ["c"])
+@pytest.mark.parametrize(
+    ("badness", "count", "best", "worst"),
+    [([3, 1, 5, 2, 4], 10, "bda", "ce"), ([3], 10, "a", ""), ([3, 1, 5, 2, 4], 1, "b", "c")],
+)
+def test_no_case_is_among_the_best_and_the_worst(
+    badness: list[float], count: int, best: str, worst: str
+) -> None:
+    (scene,) = study_scenes("test", 1, 0)
+    clips = [PredictionClip(scene, (), 0, "prediction", "abcde"[i]) for i in range(len(badness))]
+    found = [(clip.caption, clip.place) for clip in extreme_clips(clips, badness, count)]
+    assert found == [
+        *((case, f"best {rank}") for rank, case in enumerate(best, start=1)),
+        *((case, f"worst {rank}") for rank, case in enumerate(worst, start=1)),
+    ]
 
 
 def test_a_baseline_that_is_not_trained_is_absent_with_the_command(tmp_path) -> None:
@@ -135,7 +145,7 @@ def test_bundled_ones_may_be_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(name: str) -> None:
         raise CheckpointError(f"unknown checkpoint {name!r}")
 
-    monkeypatch.setattr("experiments.study.pool.load_video_model", nothing)
+    monkeypatch.setattr("experiments.study.pool.load_model", nothing)
     mage = METHODS["MAGE"]
     present, missing = find_models({"MAGE": LoadCheckpoint(mage.model), "Non-OC": LoadStill(None)})
     assert [(one.key, one.longest, one.slots) for one in present] == [("Non-OC", None, False)]
