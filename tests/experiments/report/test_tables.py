@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import controllability, robustness
+from experiments import ablations, controllability, interpretability, robustness
 from experiments.report.plots import plot_table
 from experiments.report.rows import Row
 from experiments.report.tables import DASH, Cell, Column, Line, Paper, Table, TableRow, TableSpec, columns
@@ -114,7 +114,9 @@ def every_row(spec: TableSpec) -> list[Row]:
 
 
 @pytest.mark.parametrize(
-    "spec", [*controllability.STUDY.tables, *robustness.STUDY.tables], ids=lambda s: s.title
+    "spec",
+    [t for study in (controllability, robustness, ablations, interpretability) for t in study.STUDY.tables],
+    ids=lambda s: s.title,
 )
 @pytest.mark.parametrize("width", [80, 120])
 def test_no_figure_is_cut_off(spec: TableSpec, width: int) -> None:
