@@ -60,7 +60,7 @@ COLUMNS = {
 OURS, BY_APPEARANCE = "ours", "ours, by looks"
 NO_COLOR_TERM, COLOR_TERM = "colour term off", "colour term alone"
 WRONG, CHANCE = "wrong sentence", "chance"
-METRICS = {role: f"attends_{role}" for role in ROLES}
+METRICS = tuple(f"attends_{role}" for role in ROLES)
 ENDS = "ends_in_bowl"
 
 
@@ -141,29 +141,24 @@ def read_attention(
     attention_TnhKW: np.ndarray, present_K: np.ndarray, grounding: Grounding, asked: Instruction, ends: bool
 ) -> AttentionReading:
     """Read one rollout's attention, merged to the words of `TEMPLATE`; `ends` is for `ends_in_bowl`."""
-    slots_R = named_slots(grounding, asked)
-    others_R = [
-        [
-            k
-            for one, its in grounding.things.items()
-            if one.kind == kind and one not in asked.things
-            for k in its
-        ]
-        for kind in ROLES
-    ]
-    groups = [*slots_R, list(grounding.arm), *others_R, list(grounding.background)]
+    slots_R, others_R = named_slots(grounding, asked), dict[str, list[int]](block=[], bowl=[])
+    for thing, its in grounding.things.items():
+        if thing not in asked.things:
+            others_R[thing.kind] += its
+    groups = [*slots_R, list(grounding.arm), *others_R.values(), list(grounding.background)]
     shares_R = [attention_TnhKW[..., word] for word in COLOR_WORDS]
 
     def leads(*axes: int) -> np.ndarray:
         pairs = zip(shares_R, slots_R, strict=True)
         return np.array([lead(shares.mean(axes), slots, present_K) for shares, slots in pairs])
 
+    lead_R = leads(0, 1, 2)
     return AttentionReading(
-        most_R=leads(0, 1, 2) > 0,
+        most_R=lead_R > 0,
         most_Rnh=leads(0) > 0,
         most_RT=leads(1, 2) > 0,
         chance_R=np.array([present_K[slots].sum() / present_K.sum() for slots in slots_R]),
-        margin_R=np.where(np.isfinite(leads(0, 1, 2)), leads(0, 1, 2), np.nan),
+        margin_R=np.where(np.isfinite(lead_R), lead_R, np.nan),
         shares_RTG=np.array([_group_means(shares.mean((1, 2)), groups) for shares in shares_R]),
         map_nhGW=_group_means(attention_TnhKW.mean(0).swapaxes(-1, -2), groups).swapaxes(-1, -2),
         ends_in_bowl=ends,
@@ -309,10 +304,10 @@ def scene_figures(
             if not counts_R[r]:
                 continue
             for method, most in most_VR.items():
-                figures[method, variant, METRICS[role]] = most[texts, r]
+                figures[method, variant, METRICS[r]] = most[texts, r]
             if misled and misled_R[r] is not None:
-                figures[WRONG, variant, METRICS[role]] = misled_R[r]
-            figures[CHANCE, variant, METRICS[role]] = np.mean([one.chance_R[r] for one in ours])
+                figures[WRONG, variant, METRICS[r]] = misled_R[r]
+            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
             margins = [one.margin_R[r] for one in ours]
             if not np.isnan(margins).all():
                 figures[OURS, variant, f"lead_{role}"] = np.nanmean(margins)
@@ -324,7 +319,7 @@ def scene_figures(
     for method, its in readings.items() if several else ():
         for r, n, h in np.ndindex(its[0].most_Rnh.shape):
             name = f"{method}, layer {n + 1} head {h + 1}"
-            figures[name, "all", METRICS[ROLES[r]]] = [one.most_Rnh[r, n, h] for one in its]
+            figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in its]
     return figures
 
 
@@ -467,7 +462,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 def headline(run: Run) -> dict[str, Key]:
     """The figures that are asked for by name; those of the colour term only where the model has one."""
     wanted: dict[str, Key] = {}
-    for metric in (*METRICS.values(), ENDS):
+    for metric in (*METRICS, ENDS):
         for split, variant in COLUMNS.values():
             part = {"original": "", "variants mean": "_variants", "new names": "_new_names"}[variant]
             wanted[f"{metric}_{split}{part}"] = (OURS, split, variant, metric)
@@ -483,100 +478,73 @@ LINES = {
     for line in (
         Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only"),
         Line(key=BY_APPEARANCE, hue=1, note="slots named by their appearance, as the planner does it"),
-        Line(
-            key=NO_COLOR_TERM,
-            kind="control",
-            hue=3,
-            note="the same weights without the term that compares colours",
-        ),
-        Line(
-            key=COLOR_TERM,
-            kind="control",
-            note="that term alone: whose colour is nearest to the word's, no network",
-        ),
-        Line(
-            key=WRONG,
-            kind="control",
-            hue=4,
-            note="under a sentence that names other things: should be near 0",
-        ),
+        Line(key=NO_COLOR_TERM, kind="control", hue=3, note="the same weights without the term that compares colours"),
+        Line(key=COLOR_TERM, kind="control", note="that term alone: whose colour is nearest to the word's, no network"),
+        Line(key=WRONG, kind="control", hue=4, note="under a sentence that names other things: should be near 0"),
         Line(key=CHANCE, kind="control", hue=2, note="one guess among the slots that are present"),
     )
-}
-TABLES = {
-    metric: TableSpec(title, columns(metric, COLUMNS), [LINES[method] for method in methods])
-    for metric, title, methods in (
-        *((METRICS[role], f"The named {role} attends most to its colour word", LINES) for role in ROLES),
-        (ENDS, "The named block ends in the named bowl", (OURS, NO_COLOR_TERM, WRONG)),
+}  # fmt: skip
+DOTS = [line for line in LINES.values() if line.key != COLOR_TERM]
+ATTENDS_TABLES = [
+    TableSpec(
+        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), list(LINES.values())
     )
-}
+    for role, metric in zip(ROLES, METRICS, strict=True)
+]
+ENDS_TABLE = TableSpec(
+    "The named block ends in the named bowl",
+    columns(ENDS, COLUMNS),
+    [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)],
+)
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     rows, here = list(results.rows), [one for one in found["scenes"] if one.scene.split == VARIED]
+    readings = {method: [one for o in here for one in o.readings[method]] for method in here[0].readings}
     # A scene's texts are not independent: one curve a scene.
     shares_NRTG = np.array([_nanmean([one.shares_RTG for one in o.readings[OURS]]) for o in here])
     most_NRT = np.array([np.mean([one.most_RT for one in o.readings[OURS]], axis=0) for o in here])
-    chance = float(np.mean([one.chance_R.mean() for o in here for one in o.readings[OURS]]))
-    dots = [
-        plot_table(
-            f"{METRICS[role]}.png", TABLES[METRICS[role]], rows, label=f"named {role} attends most",
-            lines=[line for line in LINES.values() if line.key != COLOR_TERM],
-        )
-        for role in ROLES
-    ]  # fmt: skip
-    often = Section(
-        "How often does the named thing attend most?",
-        "Every slot divides its attention among the words: its shares sum to 1, or to less by what a text encoder's "
-        "special tokens get. A slot attends most to a word if its share for that word is larger than that of every "
-        "other slot that is present, table included; equal is not more. Shares are averaged over steps, layers and "
-        "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave no "
-        "slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is in no "
-        "training caption.",
-        [*(measured(TABLES[METRICS[role]], rows) for role in ROLES), *dots],
-    )
-    shares = [
-        curves(
-            f"shares_{role}.png", {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)},
-            f"share for the {role}'s colour", "Mean over scenes with its 95 % interval.",
-        )
-        for r, role in enumerate(ROLES)
-    ]  # fmt: skip
+    chance = float(np.mean([one.chance_R for one in readings[OURS]]))
+    dots, curves = [], []
+    for r, (role, table) in enumerate(zip(ROLES, ATTENDS_TABLES, strict=True)):
+        label = f"named {role} attends most"
+        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=DOTS))
+        shares = {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)}
+        caption = "Mean over scenes with its 95 % interval."
+        curves.append(plot_curves(f"shares_{role}.png", shares, f"share for the {role}'s colour", caption))
+    most = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
     caption = "Share of instructions in which the named thing attends most to its colour word, step by step."
-    most_RNT = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
-    often_each_step = curves("most.png", most_RNT, "attends most", caption, [(chance, "chance")])
-    sections = [often]
-    if NO_COLOR_TERM in here[0].readings:
-        text = (
-            "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
-            "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
-            f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
-            "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
-        )
-        without = mean_map("attention_no_colour_term.png", here, NO_COLOR_TERM, "without the colour term")
-        ends = measured(TABLES[ENDS], rows)
-        sections.append(Section("Does the colour-matching term decide it?", text, [ends, without]))
-    return [
-        *sections,
+    curves.append(plot_curves("most.png", most, "attends most", caption, [(chance, "chance")]))
+    sections = [
+        Section(
+            "How often does the named thing attend most?",
+            "Every slot divides its attention among the words: its shares sum to 1, less what a text encoder's special "
+            "tokens get. A slot attends most to a word if its share for that word is larger than that of every "
+            "other slot that is present, table included; equal is not more. Shares are averaged over steps, layers and "
+            "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave "
+            "no slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is "
+            "in no training caption.",
+            [*(measured(table, rows) for table in ATTENDS_TABLES), *dots],
+        ),
         Section(
             "Head by head",
             "The same figure for each layer and head by itself, over all instructions of these scenes.",
-            [head_figure(here, method, r) for method in here[0].readings for r in range(len(ROLES))],
+            [head_figure(its, method, r) for method, its in readings.items() for r in range(len(ROLES))],
         ),
         Section(
             "What each thing attends to",
             "Mean share of each thing's slots for each word: over all heads, and head by head.",
             [
-                mean_map("attention.png", here, OURS, "all heads"),
-                head_maps(here),
+                mean_map("attention.png", readings[OURS], "all heads"),
+                head_maps(readings[OURS]),
                 *(words for _, words in found["pictures"] if words),
             ],
         ),
         Section(
             "Over time",
             "Shares for the two colour words while the arm reaches, carries and retreats; mean over layers and heads.",
-            [*shares, often_each_step],
+            curves,
         ),
         Section(
             "Seen over the picture",
@@ -585,6 +553,17 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             [Clips([clip for clip, _ in found["pictures"]])],
         ),
     ]
+    if NO_COLOR_TERM in readings:
+        text = (
+            "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
+            "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
+            f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
+            "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
+        )
+        without = mean_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], "without the colour term")
+        ends = measured(ENDS_TABLE, rows)
+        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends, without]))
+    return sections
 
 
 def measured(spec: TableSpec, rows: Sequence[Row]) -> Table:
@@ -610,17 +589,16 @@ def word_map(
     )
 
 
-def mean_map(name: str, outcomes: Sequence[AttentionOutcome], method: str, what: str) -> Figure:
+def mean_map(name: str, readings: Sequence[AttentionReading], what: str) -> Figure:
     """The map of all scenes."""
-    readings = [one for outcome in outcomes for one in outcome.readings[method]]
     words = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
     caption = f"Mean over scenes, instructions, steps, layers and heads ({what})."
     return word_map(name, readings, GROUPS, words, caption)
 
 
-def head_figure(outcomes: Sequence[AttentionOutcome], method: str, r: int) -> Figure:
+def head_figure(readings: Sequence[AttentionReading], method: str, r: int) -> Figure:
     """How often each layer and head attends most."""
-    most_nh = np.mean([one.most_Rnh[r] for outcome in outcomes for one in outcome.readings[method]], axis=0)
+    most_nh = np.mean([one.most_Rnh[r] for one in readings], axis=0)
     ending, of = ("", "") if method == OURS else ("_no_colour_term", f", {method}")
     return heat_map(
         f"heads_{ROLES[r]}{ending}.png", most_nh, [f"layer {n + 1}" for n in range(len(most_nh))],
@@ -629,9 +607,9 @@ def head_figure(outcomes: Sequence[AttentionOutcome], method: str, r: int) -> Fi
     )  # fmt: skip
 
 
-def head_maps(outcomes: Sequence[AttentionOutcome]) -> Figure:
+def head_maps(readings: Sequence[AttentionReading]) -> Figure:
     """The map of each layer and head."""
-    maps_nhGW = _nanmean([one.map_nhGW for outcome in outcomes for one in outcome.readings[OURS]])
+    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
     there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3)))
     layers, heads = maps_nhGW.shape[:2]
     return heat_grid(
@@ -641,14 +619,14 @@ def head_maps(outcomes: Sequence[AttentionOutcome]) -> Figure:
     )  # fmt: skip
 
 
-def curves(
+def plot_curves(
     name: str,
     along_NT: Mapping[str, np.ndarray],
     label: str,
     caption: str,
     marks: Sequence[tuple[float, str]] = (),
 ) -> Figure:
-    """Means over scenes, step by step; nan for scenes that do not count."""
+    """Means over scenes with intervals, step by step; nan for scenes that do not count."""
     bands = []
     for title, values_NT in along_NT.items():
         known = values_NT[~np.isnan(values_NT).any(1)]
@@ -662,13 +640,13 @@ _, PLAIN, OTHERS, _, NEW = COLUMNS.values()
 CARDS = [
     CardSpec(label, LINES[method], Column("", *place, metric), compare)
     for label, method, place, metric, compare in (
-        ("Block, original", OURS, PLAIN, METRICS["block"], "not in the paper"),
-        ("Bowl, original", OURS, PLAIN, METRICS["bowl"], "not in the paper"),
-        ("Bowl, three other bowls", OURS, OTHERS, METRICS["bowl"], "not in the paper"),
-        ("Block, new colour names", OURS, NEW, METRICS["block"], "not in the paper"),
-        ("Bowl, wrong sentence", WRONG, PLAIN, METRICS["bowl"], "should be near 0"),
-        ("Chance", CHANCE, PLAIN, METRICS["bowl"], "one guess among the slots"),
-        ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS["bowl"], "what the rest has learned"),
+        ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
+        ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
+        ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
+        ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
+        ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
+        ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
+        ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
         ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
     )
 ]
@@ -682,7 +660,7 @@ STUDY = Study(
     units=units,
     cases=cases,
     rows=lambda run, found: figure_rows((one.scene.split, one.figures) for one in found["scenes"]),
-    tables=list(TABLES.values()),
+    tables=[*ATTENDS_TABLES, ENDS_TABLE],
     page=page,
     cards=CARDS,
     headline=headline,
