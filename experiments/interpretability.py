@@ -3,119 +3,668 @@
     python experiments/interpretability.py              # default: a few minutes on 2 cores
     python experiments/interpretability.py --quick      # a first look
 
-Reads the text-to-slot attention of imagined rollouts (paper, section 4.5): which words each slot listens to, head by
+Reads the text-to-slot attention of imagined rollouts (paper, section 4.5): which words each slot attends to, head by
 head and over time, and one number, how often the slot of the named block (bowl) is the one that attends most to its
-colour word. Beside it: chance, the same slots under a sentence that names something else, and the model with its
-colour-matching term switched off, because that term alone could decide. Writes `results.json`, `report.html`, plots
-and clips into `--out`.
+colour word. Scenes of three splits are imagined with their instruction: test, controllability (also with three other
+target bowls) and unseen_colors, whose captions also use colour names that no training caption had. Beside it: chance,
+the same slots under a sentence that names something else, and the model with its colour-matching term switched off,
+because that term alone could decide. Writes `results.json`, `report.html`, plots and clips into `--out`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
-from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.listening import ROLES
-from experiments.protocol.listening_gallery import ListeningPictures, choose_listening
-from experiments.protocol.listening_report import attends_table, build_report
-from experiments.protocol.listening_rows import COLUMNS, head_rows, headline, listening_rows
-from experiments.protocol.listening_scenes import ListeningOutcome, ListeningScene
-from experiments.protocol.running import StudyRun
-from experiments.protocol.scenes import test_scenes
-from experiments.protocol.workers import LoadWorldModel
-from experiments.reporting import Results, StudyProgress
-from textocvp import WorldModel
+import numpy as np
+import torch
 
+from envs.colors import SEEN
+from experiments.report.gif import gif
+from experiments.report.page import CardSpec, Clip, Clips, Figure, Section
+from experiments.report.plots import curve_plot, heat_grid, heat_map, plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Key, Row, figure_rows
+from experiments.report.tables import Column, Line, Table, TableSpec, columns
+from experiments.study.clips import tone
+from experiments.study.judge import find_things
+from experiments.study.methods import HORIZON
+from experiments.study.pool import Unit, Worker
+from experiments.study.predictions import to_uint8
+from experiments.study.run import Found, Part, Run, Study, UsageError, start
+from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes, wrong_text
+from planning import RELATIONS, AppearanceGrounder, Grounding, Instruction, SegmentationGrounder
+from textocvp import Rollout, WorldModel
+from textocvp.metrics.intervals import bootstrap_interval
+from textocvp.predictors.textocvp import color_match
+from textocvp.slots import SlotState
+
+TEMPLATE = ("put", "the", "block's colour", "block", "in", "the", "bowl's colour", "bowl")
+"""An instruction, word by word; a colour is one word, whatever its name."""
+ROLES = ("block", "bowl")
+COLOR_WORDS = (TEMPLATE.index("block's colour"), TEMPLATE.index("bowl's colour"))
+GROUPS = ("named block", "named bowl", "arm", "other blocks", "other bowls", "table")
+"""What a map of attention has a row for."""
 VARIANTS = 3
 VARIED = "controllability"  # the split whose scenes have enough bowls for other instructions
-SECONDS = {"scenes": 1.0, "pictures": 1.5}  # of one unit on one core; they only weigh the progress bar
-
-
-@dataclass
-class Args(StudyArgs):
-    """Interpretability study: which words the slots of named and unnamed things attend to.
-
-    Scenes of three splits are imagined with their instruction: test, controllability (also with three other target
-    bowls) and unseen_colors, whose captions also use colour names that no training caption had. Which slot is
-    which thing is told by the simulator's segmentation, for measuring only; a second row tells it by appearance.
-    """
-
-    out: Path = Path("results/interpretability")
-    """Folder for results.json, report.html, plots and clips."""
-
-    @property
-    def sizes(self) -> Sizes:
-        """How much is measured."""
-        return QUICK if self.quick else DEFAULT
+COLUMNS = {
+    "test": ("test", "original"),
+    "4 bowls, original": (VARIED, "original"),
+    "4 bowls, other bowls": (VARIED, "variants mean"),
+    "unseen colours": ("unseen_colors", "original"),
+    "new names": ("unseen_colors", "new names"),
+}
+"""Column of the tables -> (split, variant in results.json)."""
+OURS, BY_APPEARANCE = "ours", "ours, by looks"
+NO_COLOR_TERM, COLOR_TERM = "colour term off", "colour term alone"
+WRONG, CHANCE = "wrong sentence", "chance"
+METRICS = tuple(f"attends_{role}" for role in ROLES)
+ENDS = "ends_in_bowl"
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        scenes: of each split.
-        clips: how many best and how many worst cases the report shows.
-    """
-
-    scenes: int
-    clips: int
+    scenes: int  # of each split
+    clips: int  # how many best and how many worst cases are shown
 
 
-QUICK = Sizes(scenes=30, clips=10)
-DEFAULT = Sizes(scenes=150, clips=10)
+# --- reading attention ------------------------------------------------------------------------------------------------
+
+GLOW = np.array((255, 138, 30), dtype=np.float64)  # what is painted over a slot that attends
+_MARKS = ("\u2581", "##", "\u0120")  # how tokenizers mark the begin of a word, or its going on
+_SPECIAL = (("<", ">"), ("[", "]"))  # as in </s> and [CLS]
 
 
-def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = None) -> Results:
-    """Run the study and write its folder.
+def words_of(text: str) -> tuple[str, ...]:
+    """`TEMPLATE` with the colours of an instruction."""
+    block, bowl = Instruction.parse(text).things
+    return ("put", "the", block.color, "block", "in", "the", bowl.color, "bowl")
+
+
+def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.ndarray:
+    """Values of tokens, summed to values of the words of `TEMPLATE`; special and padding tokens are left out.
 
     Args:
-        args: the command line.
-        load: makes the world model; by default loads `args.checkpoint`.
-        sizes: how much is measured; by default what `args` ask for.
+        values: (..., L); L may be more than there are tokens.
+        tokens: of the text, as the encoder sees them.
+        text: an instruction.
+
+    Returns:
+        (..., 8).
 
     Raises:
-        OSError: if the folder cannot be written, before any work is done.
-        CheckpointError: if there is no such checkpoint, before any work is done.
-        UsageError: if the checkpoint hears no text.
+        UsageError: if the tokens do not spell the words of the text.
     """
-    run, sizes = StudyRun.open("interpretability", args, load), sizes or args.sizes
+    words, spelled = [word.replace(" ", "") for word in words_of(text)], [""]
+    merged = np.zeros((*values.shape[:-1], len(words)), dtype=values.dtype)
+    for column, token in enumerate(tokens):
+        letters = token.lower().replace(" ", "")
+        for mark in _MARKS:
+            letters = letters.removeprefix(mark)
+        if not letters or any(token.startswith(a) and token.endswith(b) for a, b in _SPECIAL):
+            continue
+        if spelled[-1] == words[len(spelled) - 1]:
+            spelled.append("")
+        spelled[-1] += letters
+        if len(spelled) > len(words) or not words[len(spelled) - 1].startswith(spelled[-1]):
+            break
+        merged[..., len(spelled) - 1] += values[..., column]
+    if spelled != words:
+        raise UsageError(f"the tokens {list(tokens)} do not spell the words of {text!r}")
+    return merged
+
+
+@dataclass(frozen=True, eq=False)
+class AttentionReading:
+    """How the slots of one rollout attend. Axes: R roles, T steps, n layers, h heads, G groups, W words.
+
+    A slot attends most to a word if it gives it a larger share of its attention than any other present slot does; its
+    shares sum to 1 over the words. Equal is not more. A thing of several slots attends most if one of them does; one
+    without a slot never does.
+    """
+
+    most_R: np.ndarray  # whether the named thing attends most to its colour word, by means over T, n and h
+    most_Rnh: np.ndarray  # the same for each layer and head, by means over T
+    most_RT: np.ndarray  # the same for each step, by means over n and h
+    chance_R: np.ndarray  # the thing's share of the present slots
+    margin_R: np.ndarray  # how far its share is above the largest of all others (negative: below), or nan
+    shares_RTG: np.ndarray  # each group's mean share for the role's colour word; nan without such a thing
+    map_nhGW: np.ndarray  # each group's mean shares over T
+    ends_in_bowl: bool  # whether the named block's slot ends near where the named bowl's slot was
+
+
+def read_attention(
+    attention_TnhKW: np.ndarray, present_K: np.ndarray, grounding: Grounding, asked: Instruction, ends: bool
+) -> AttentionReading:
+    """Read one rollout's attention, merged to the words of `TEMPLATE`; `ends` is for `ends_in_bowl`."""
+    slots_R, others_R = named_slots(grounding, asked), dict[str, list[int]](block=[], bowl=[])
+    for thing, its in grounding.things.items():
+        if thing not in asked.things:
+            others_R[thing.kind] += its
+    groups = [*slots_R, list(grounding.arm), *others_R.values(), list(grounding.background)]
+    shares_R = [attention_TnhKW[..., word] for word in COLOR_WORDS]
+
+    def leads(*axes: int) -> np.ndarray:
+        pairs = zip(shares_R, slots_R, strict=True)
+        return np.array([lead(shares.mean(axes), slots, present_K) for shares, slots in pairs])
+
+    lead_R = leads(0, 1, 2)
+    return AttentionReading(
+        most_R=lead_R > 0,
+        most_Rnh=leads(0) > 0,
+        most_RT=leads(1, 2) > 0,
+        chance_R=np.array([present_K[slots].sum() / present_K.sum() for slots in slots_R]),
+        margin_R=np.where(np.isfinite(lead_R), lead_R, np.nan),
+        shares_RTG=np.array([_group_means(shares.mean((1, 2)), groups) for shares in shares_R]),
+        map_nhGW=_group_means(attention_TnhKW.mean(0).swapaxes(-1, -2), groups).swapaxes(-1, -2),
+        ends_in_bowl=ends,
+    )
+
+
+def named_slots(grounding: Grounding, asked: Instruction) -> list[list[int]]:
+    """The slots of the named block and of the named bowl."""
+    return [list(grounding.things.get(thing, ())) for thing in asked.things]
+
+
+def lead(shares: np.ndarray, slots: Sequence[int], present_K: np.ndarray) -> np.ndarray:
+    """How much larger the share of these slots is than that of every other present one: (..., K) -> (...).
+
+    -inf for a thing without a present slot.
+    """
+    own_K = np.zeros_like(present_K)
+    own_K[list(slots)] = True
+    own = np.where(own_K & present_K, shares, -np.inf).max(-1)
+    others = np.where(~own_K & present_K, shares, -np.inf).max(-1)
+    with np.errstate(invalid="ignore"):  # no slot of either kind
+        return np.where(np.isneginf(own), -np.inf, own - others)
+
+
+def named_most(
+    shares_KW: np.ndarray, grounding: Grounding, asked: Instruction, present_K: np.ndarray
+) -> list[bool]:
+    """Whether the named block and the named bowl attend most to the sentence's colour words."""
+    pairs = zip(COLOR_WORDS, named_slots(grounding, asked), strict=True)
+    return [bool(lead(shares_KW[:, word], slots, present_K) > 0) for word, slots in pairs]
+
+
+def _group_means(shares: np.ndarray, groups: Sequence[list[int]]) -> np.ndarray:
+    """(..., K) -> (..., G), nan for an empty group."""
+    empty = np.full(shares.shape[:-1], np.nan)
+    return np.stack([shares[..., group].mean(-1) if group else empty for group in groups], axis=-1)
+
+
+def ends_in_bowl(rollout: Rollout, index: int, grounding: Grounding, asked: Instruction) -> bool:
+    """Whether the named block's slot ends near where the named bowl's slot was, for one rollout of a batch."""
+    block, bowl = named_slots(grounding, asked)
+    if not block or not bowl:
+        return False
+    places_TK2 = rollout.select(index).positions[0]
+    apart = places_TK2[-1, block].mean(0) - places_TK2[0, bowl].mean(0)
+    return float(apart.norm()) <= RELATIONS[asked.relation].within_px
+
+
+def without_color_term(model: object) -> WorldModel | None:
+    """A copy of a model whose attention has lost the term that compares colours; None if it never had one."""
+    if not isinstance(model, WorldModel):
+        return None
+    network = copy.deepcopy(model.model)
+    gains = [gain for name, gain in network.predictor.named_parameters() if name.endswith("color_gain_h")]
+    with torch.no_grad():
+        for gain in gains:
+            gain.zero_()
+    return WorldModel(network, model.checkpoint) if gains else None
+
+
+# --- units of work ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class AttentionOutcome:
+    """One scene, its own instruction and its variants: V texts."""
+
+    scene: StudyScene
+    texts: tuple[str, ...]
+    # V of `OURS`, slots named by the simulator's segmentation of the first frame, for measuring only; and the same of
+    # the model without its colour-matching term, if it has one
+    readings: Mapping[str, tuple[AttentionReading, ...]]
+    figures: Mapping[tuple[str, str, str], Any]  # see `figure_rows`
+
+
+@dataclass(frozen=True)
+class AttentionScene:
+    """A unit of work: one scene and its texts."""
+
+    scene: StudyScene
+    variants: int  # how many other target bowls are named as well
+    seed: int  # of the slots
+
+    def run(self, worker: Worker) -> AttentionOutcome:
+        """Imagine, name the slots, read the attention."""
+        model = cast(WorldModel, worker.world_model)
+        sampled, parsed, truth, present_K = parse_scene(worker, self.scene, self.variants, self.seed)
+        texts, wrong = sampled.texts, wrong_text(sampled)
+        asked = [Instruction.parse(text) for text in texts]
+        (*attention, misread_TnhKW), rollout = imagine(model, parsed, [*texts, wrong], self.seed)
+
+        def read(attention: Sequence[np.ndarray], rollout: Rollout) -> tuple[AttentionReading, ...]:
+            ends = [ends_in_bowl(rollout, b, truth, one) for b, one in enumerate(asked)]
+            parts = zip(attention, asked, ends, strict=True)
+            return tuple(read_attention(a, present_K, truth, one, end) for a, one, end in parts)
+
+        def most(shares_VKW: Iterable[np.ndarray], things: Grounding) -> np.ndarray:
+            pairs = zip(shares_VKW, asked, strict=True)
+            return np.array([named_most(shares_KW, things, one, present_K) for shares_KW, one in pairs])
+
+        seen = find_things(parsed, AppearanceGrounder.from_info(sampled.info), asked) or Grounding((), ())
+        readings = {OURS: read(attention, rollout)}
+        most_VR = {BY_APPEARANCE: most((one.mean((0, 1, 2)) for one in attention), seen)}
+        if (without := without_color_term(model)) is not None:
+            readings[NO_COLOR_TERM] = read(*imagine(without, parsed, texts, self.seed))
+            most_VR[COLOR_TERM] = most(color_term(model, parsed, texts, present_K), truth)
+        most_VR |= {method: np.array([one.most_R for one in its]) for method, its in readings.items()}
+        most_R = named_most(misread_TnhKW.mean((0, 1, 2)), truth, asked[0], present_K)
+        pairs = zip(most_R, asked[0].things, Instruction.parse(wrong).things, strict=True)
+        misled_R = [most if own != other else None for most, own, other in pairs]
+        ends = ends_in_bowl(rollout, len(asked), truth, asked[0])
+        figures = scene_figures(asked[0], readings, most_VR, misled_R, ends)
+        return AttentionOutcome(self.scene, texts, readings, figures)
+
+
+def scene_figures(
+    own: Instruction,
+    readings: Mapping[str, Sequence[AttentionReading]],
+    most_VR: Mapping[str, np.ndarray],
+    misled_R: Sequence[bool | None],
+    misled_ends: bool,
+) -> dict[tuple[str, str, str], Any]:
+    """Figures of a scene.
+
+    Args:
+        own: its own instruction.
+        readings: see `AttentionOutcome`.
+        most_VR: method -> (V, R) bool, whether the named things attend most to their colour words.
+        misled_R: whether the things that `own` names attend most under a sentence that names others; None where it must
+            name the same.
+        misled_ends: whether under that sentence the block still ends in the first bowl.
+    """
+    figures: dict[tuple[str, str, str], Any] = {}
+    several = len(readings[OURS]) > 1
+    new_R = [thing.color not in SEEN for thing in own.things]
+    for variant, texts, counts_R in (
+        ("original", slice(0, 1), [True, True]),
+        ("variants mean", slice(1, None), [several, several]),
+        ("new names", slice(0, 1), new_R),  # what no training caption named
+    ):
+        ours, misled = readings[OURS][texts], variant != "variants mean"
+        for r, role in enumerate(ROLES):
+            if not counts_R[r]:
+                continue
+            for method, most in most_VR.items():
+                figures[method, variant, METRICS[r]] = most[texts, r]
+            if misled and misled_R[r] is not None:
+                figures[WRONG, variant, METRICS[r]] = misled_R[r]
+            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
+            margins = [one.margin_R[r] for one in ours]
+            if not np.isnan(margins).all():
+                figures[OURS, variant, f"lead_{role}"] = np.nanmean(margins)
+        if any(counts_R):
+            for method, its in readings.items():
+                figures[method, variant, ENDS] = [one.ends_in_bowl for one in its[texts]]
+            if misled:
+                figures[WRONG, variant, ENDS] = misled_ends
+    for method, its in readings.items() if several else ():
+        for r, n, h in np.ndindex(its[0].most_Rnh.shape):
+            name = f"{method}, layer {n + 1} head {h + 1}"
+            figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in its]
+    return figures
+
+
+def parse_scene(
+    worker: Worker, scene: StudyScene, variants: int, seed: int
+) -> tuple[SampledScene, Rollout, Grounding, np.ndarray]:
+    """A scene, its first frame parsed, which slot is what by the simulator's segmentation, and which are present."""
+    sampled = sample_scene(worker.environment(scene), scene, variants)
+    parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=seed)
+    truth = SegmentationGrounder.from_info(sampled.info)(parsed)
+    return sampled, parsed, truth, parsed.presence[0, 0].numpy() >= 0.5
+
+
+def imagine(
+    model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int
+) -> tuple[list[np.ndarray], Rollout]:
+    """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`.
+
+    Raises:
+        UsageError: if the model reads no text.
+    """
+    horizon = min(HORIZON, model.longest_horizon or HORIZON)
+    rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
+    if rollout.attention is None:
+        raise UsageError(f"{model.checkpoint.name} keeps no attention from slots to words: it reads no text")
+    pairs = zip(rollout.attention.double().cpu().numpy(), texts, strict=True)
+    return [merge_tokens(attention, model.words(text), text) for attention, text in pairs], rollout
+
+
+@torch.no_grad()
+def color_term(
+    model: WorldModel, parsed: Rollout, texts: Sequence[str], present_K: np.ndarray
+) -> list[np.ndarray]:
+    """What comparing each slot's colour with the lexicon's says by itself, (K, W) for each text."""
+    color_BK3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
+    matches = [
+        color_match(color_BK3, torch.from_numpy(present_K)[None], model.model.text([t])) for t in texts
+    ]
+    pairs = zip(matches, texts, strict=True)
+    return [merge_tokens(match_BKL[0].numpy(), model.words(text), text) for match_BKL, text in pairs]
+
+
+@dataclass(frozen=True)
+class AttentionPicture:
+    """A unit of work: attention to the colour words, painted over what is imagined in one case of the study."""
+
+    scene: StudyScene
+    variants: int  # see `AttentionScene`
+    seed: int
+    variant: int  # which of its texts
+    margin: float  # the figure it was chosen for
+    success: bool  # whether both named things attend most to their colour words
+    rank: int  # its place among the best or the worst
+    best: bool
+
+    def run(self, worker: Worker) -> tuple[Clip, Figure | None]:
+        """Imagine it once more, and paint: a clip, and for the first of each kind a map of slots and words."""
+        sampled, parsed, truth, present_K = parse_scene(worker, self.scene, self.variants, self.seed)
+        text = sampled.texts[self.variant]
+        asked, kind = Instruction.parse(text), "best" if self.best else "worst"
+        (attention_TnhKW,), rollout = imagine(cast(WorldModel, worker.world_model), parsed, [text], self.seed)
+        frames_THW3, masks_TKHW = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
+        shares_TKW = attention_TnhKW.mean((1, 2))
+        glowing = [glow(frames_THW3, masks_TKHW, shares_TKW[..., word]) for word in COLOR_WORDS]
+        figure = f"lead {self.margin:.3f}" if np.isfinite(self.margin) else "a named thing has no slot"
+        clip = Clip(
+            name=f"attention-{kind}-{self.rank}.gif",
+            gif=gif([[frames_THW3, *glowing]]),
+            panels=("imagined", *(f'"{thing.color}"' for thing in asked.things)),
+            title=text,
+            caption=f"{self.scene.split.replace('_', ' ')}, seed {self.scene.seed}; {figure}",
+            badge=f"{kind} {self.rank}: {'both attend most' if self.success else 'missed'}",
+            tone=tone(self.success),
+        )
+        if self.rank > 1:
+            return clip, None
+        reading = read_attention(attention_TnhKW, present_K, truth, asked, False)
+        names = [*map(str, asked.things), *GROUPS[2:]]
+        caption = f"The {kind} case: mean share over steps, layers and heads."
+        return clip, word_map(f"words-{kind}.png", [reading], names, words_of(text), caption)
+
+
+def glow(frames_THW3: np.ndarray, masks_TKHW: np.ndarray, shares_SK: np.ndarray) -> np.ndarray:
+    """Frames in faint grey, with each slot as bright as its share of attention to one word.
+
+    Args:
+        frames_THW3: uint8.
+        masks_TKHW: 0..1.
+        shares_SK: of the S = T - 1 steps; step s looked at frame s and imagined frame s + 1, over which it is painted.
+            The brightest share of the whole video is full.
+    """
+    shares_TK = np.concatenate([shares_SK[:1], shares_SK])[: len(frames_THW3)]
+    strength = np.einsum("tkhw,tk->thw", masks_TKHW, shares_TK / max(float(shares_SK.max()), 1e-9))[..., None]
+    grey = 0.25 * frames_THW3.mean(-1, keepdims=True) + 24
+    return (grey * (1 - strength) + GLOW * strength).clip(0, 255).round().astype(np.uint8)
+
+
+def check_model(run: Run) -> None:
+    """Refuse a model that reads no text."""
     model = run.world_model
     if isinstance(model, WorldModel) and not model.model.predictor.uses_text:
-        raise UsageError(f"{args.checkpoint} hears no text, so there is no attention to read")
-    pool = run.pool
-    splits = dict.fromkeys(split for split, _ in COLUMNS.values())
-    units = [
-        ListeningScene(scene, VARIANTS if split == VARIED else 0, args.seed)
+        raise UsageError(f"{run.args.checkpoint} reads no text, so there is no attention to look at")
+
+
+def units(run: Run) -> dict[str, Part]:
+    """The scenes of every split."""
+    seed, splits = run.args.seed, dict.fromkeys(split for split, _ in COLUMNS.values())
+    scenes = [
+        AttentionScene(scene, VARIANTS if split == VARIED else 0, seed)
         for split in splits
-        for scene in test_scenes(split, sizes.scenes, args.seed)
+        for scene in study_scenes(split, run.sizes.scenes, seed)
     ]
-    parts = {"scenes": len(units), "pictures": 2 * min(sizes.clips, len(units))}
-    outcomes: list[ListeningOutcome] = []
-    with StudyProgress({part: (n, SECONDS[part]) for part, n in parts.items()}) as progress:
-        for outcome in progress.track("scenes", pool.run(units)):
-            outcomes.append(outcome)
-            if len(outcomes) % 5 == 0:
-                rows = listening_rows(outcomes)
-                progress.show(*(attends_table(rows, role) for role in ROLES))
-        chosen = choose_listening(outcomes, VARIANTS, args.seed, sizes.clips)
-        pictures: list[ListeningPictures] = list(progress.track("pictures", pool.run(chosen)))
-    rows = [*listening_rows(outcomes), *head_rows(outcomes, VARIED)]
-    results = run.results(rows, headline(rows), seeds_used(args.seed, units))
-    run.write(build_report(results, outcomes, pictures, VARIED, run.command))
-    run.close(progress, results, [attends_table(rows, role) for role in ROLES])
-    return results
+    return {"scenes": Part(scenes), "pictures": Part((), 1.5, 2 * min(run.sizes.clips, len(scenes)))}
 
 
-def seeds_used(slots: int, units: Sequence[ListeningScene]) -> dict[str, list[int]]:
-    """Every seed, by what it was used for."""
-    seeds: dict[str, list[int]] = {"slots": [slots]}
-    for unit in units:
-        seeds.setdefault(f"scenes, {unit.scene.split}", []).append(unit.scene.seed)
-    return seeds
+def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -> list[AttentionPicture]:
+    """The cases with the largest and the smallest lead of the named things, each of another scene."""
+    chosen = []
+    # The smaller of the two leads; a thing without a slot is the worst case there is.
+    ranked = [
+        (float(np.nan_to_num(one.margin_R, nan=-np.inf).min()), bool(one.most_R.all()), v, outcome)
+        for outcome in outcomes
+        for v, one in enumerate(outcome.readings[OURS])
+    ]
+    for best in (True, False):
+        firsts: dict[int, tuple[float, bool, int, AttentionOutcome]] = {}
+        for case in sorted(ranked, key=lambda case: -case[0] if best else case[0]):
+            firsts.setdefault(case[-1].scene.seed, case)
+        for rank, (margin, success, v, outcome) in enumerate(list(firsts.values())[:count], start=1):
+            variants = VARIANTS if len(outcome.texts) > 1 else 0
+            chosen.append(AttentionPicture(outcome.scene, variants, seed, v, margin, success, rank, best))
+    return chosen
 
+
+def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
+    """The best and the worst."""
+    return {"pictures": extreme_cases(found["scenes"], run.args.seed, run.sizes.clips)}
+
+
+def headline(run: Run) -> dict[str, Key]:
+    """The figures that are asked for by name; those of the colour term only where the model has one."""
+    wanted: dict[str, Key] = {}
+    for metric in (*METRICS, ENDS):
+        for split, variant in COLUMNS.values():
+            part = {"original": "", "variants mean": "_variants", "new names": "_new_names"}[variant]
+            wanted[f"{metric}_{split}{part}"] = (OURS, split, variant, metric)
+        for method in (NO_COLOR_TERM, WRONG, CHANCE):
+            wanted[f"{metric}_{method.replace(' ', '_')}"] = (method, VARIED, "original", metric)
+    return wanted
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+LINES = {
+    line.key: line
+    for line in (
+        Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only"),
+        Line(key=BY_APPEARANCE, hue=1, note="slots named by their appearance, as the planner does it"),
+        Line(key=NO_COLOR_TERM, kind="control", hue=3, note="the same weights without the term that compares colours"),
+        Line(key=COLOR_TERM, kind="control", note="that term alone: whose colour is nearest to the word's, no network"),
+        Line(key=WRONG, kind="control", hue=4, note="under a sentence that names other things: should be near 0"),
+        Line(key=CHANCE, kind="control", hue=2, note="one guess among the slots that are present"),
+    )
+}  # fmt: skip
+DOTS = [line for line in LINES.values() if line.key != COLOR_TERM]
+ATTENDS_TABLES = [
+    TableSpec(
+        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), list(LINES.values())
+    )
+    for role, metric in zip(ROLES, METRICS, strict=True)
+]
+ENDS_TABLE = TableSpec(
+    "The named block ends in the named bowl",
+    columns(ENDS, COLUMNS),
+    [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)],
+)
+
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    rows, here = list(results.rows), [one for one in found["scenes"] if one.scene.split == VARIED]
+    readings = {method: [one for o in here for one in o.readings[method]] for method in here[0].readings}
+    # A scene's texts are not independent: one curve a scene.
+    shares_NRTG = np.array([_nanmean([one.shares_RTG for one in o.readings[OURS]]) for o in here])
+    most_NRT = np.array([np.mean([one.most_RT for one in o.readings[OURS]], axis=0) for o in here])
+    chance = float(np.mean([one.chance_R for one in readings[OURS]]))
+    dots, curves = [], []
+    for r, (role, table) in enumerate(zip(ROLES, ATTENDS_TABLES, strict=True)):
+        label = f"named {role} attends most"
+        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=DOTS))
+        shares = {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)}
+        caption = "Mean over scenes with its 95 % interval."
+        curves.append(plot_curves(f"shares_{role}.png", shares, f"share for the {role}'s colour", caption))
+    most = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
+    caption = "Share of instructions in which the named thing attends most to its colour word, step by step."
+    curves.append(plot_curves("most.png", most, "attends most", caption, [(chance, "chance")]))
+    sections = [
+        Section(
+            "How often does the named thing attend most?",
+            "Every slot divides its attention among the words: its shares sum to 1, less what a text encoder's special "
+            "tokens get. A slot attends most to a word if its share for that word is larger than that of every "
+            "other slot that is present, table included; equal is not more. Shares are averaged over steps, layers and "
+            "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave "
+            "no slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is "
+            "in no training caption.",
+            [*(measured(table, rows) for table in ATTENDS_TABLES), *dots],
+        ),
+        Section(
+            "Head by head",
+            "The same figure for each layer and head by itself, over all instructions of these scenes.",
+            [head_figure(its, method, r) for method, its in readings.items() for r in range(len(ROLES))],
+        ),
+        Section(
+            "What each thing attends to",
+            "Mean share of each thing's slots for each word: over all heads, and head by head.",
+            [
+                mean_map("attention.png", readings[OURS], "all heads"),
+                head_maps(readings[OURS]),
+                *(words for _, words in found["pictures"] if words),
+            ],
+        ),
+        Section(
+            "Over time",
+            "Shares for the two colour words while the arm reaches, carries and retreats; mean over layers and heads.",
+            curves,
+        ),
+        Section(
+            "Seen over the picture",
+            "The cases in which the named things lead the most and the least. Each slot glows with its share of "
+            "attention to the block's colour word and to the bowl's.",
+            [Clips([clip for clip, _ in found["pictures"]])],
+        ),
+    ]
+    if NO_COLOR_TERM in readings:
+        text = (
+            "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
+            "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
+            f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
+            "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
+        )
+        without = mean_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], "without the colour term")
+        ends = measured(ENDS_TABLE, rows)
+        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends, without]))
+    return sections
+
+
+def measured(spec: TableSpec, rows: Sequence[Row]) -> Table:
+    """A table without the lines of what this model does not have."""
+    return replace(spec, lines=[line for line in spec.lines if any(spec.points(rows, line))]).table(rows)
+
+
+def _nanmean(values: Sequence[np.ndarray]) -> np.ndarray:
+    """Over the first axis; nan where nothing is known."""
+    seen = ~np.isnan(values)
+    sums = np.where(seen, values, 0.0).sum(0)
+    return np.where(seen.any(0), sums / np.maximum(seen.sum(0), 1), np.nan)
+
+
+def word_map(
+    name: str, readings: Sequence[AttentionReading], groups: Sequence[str], words: Sequence[str], caption: str
+) -> Figure:
+    """Mean share of each group's slots for each word."""
+    map_GW = _nanmean([one.map_nhGW for one in readings]).mean((0, 1))
+    there = [g for g in range(len(groups)) if not np.isnan(map_GW[g]).any()]
+    return heat_map(
+        name, map_GW[there], [groups[g] for g in there], words, label="attention to words", caption=caption
+    )
+
+
+def mean_map(name: str, readings: Sequence[AttentionReading], what: str) -> Figure:
+    """The map of all scenes."""
+    words = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
+    caption = f"Mean over scenes, instructions, steps, layers and heads ({what})."
+    return word_map(name, readings, GROUPS, words, caption)
+
+
+def head_figure(readings: Sequence[AttentionReading], method: str, r: int) -> Figure:
+    """How often each layer and head attends most."""
+    most_nh = np.mean([one.most_Rnh[r] for one in readings], axis=0)
+    ending, of = ("", "") if method == OURS else ("_no_colour_term", f", {method}")
+    return heat_map(
+        f"heads_{ROLES[r]}{ending}.png", most_nh, [f"layer {n + 1}" for n in range(len(most_nh))],
+        [f"head {h + 1}" for h in range(most_nh.shape[1])], label="attends most", top=1.0,
+        caption=f"How often the named {ROLES[r]} attends most to its colour word{of}.",
+    )  # fmt: skip
+
+
+def head_maps(readings: Sequence[AttentionReading]) -> Figure:
+    """The map of each layer and head."""
+    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
+    there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3)))
+    layers, heads = maps_nhGW.shape[:2]
+    return heat_grid(
+        "attention_heads.png", maps_nhGW[:, :, there], [GROUPS[g] for g in there], TEMPLATE,
+        [[f"layer {n + 1}, head {h + 1}" for h in range(heads)] for n in range(layers)],
+        label="attention to words", caption="The same for each layer and head. All maps share one scale.",
+    )  # fmt: skip
+
+
+def plot_curves(
+    name: str,
+    along_NT: Mapping[str, np.ndarray],
+    label: str,
+    caption: str,
+    marks: Sequence[tuple[float, str]] = (),
+) -> Figure:
+    """Means over scenes with intervals, step by step; nan for scenes that do not count."""
+    bands = []
+    for title, values_NT in along_NT.items():
+        known = values_NT[~np.isnan(values_NT).any(1)]
+        intervals = [bootstrap_interval(column, resamples=500) for column in known.T if len(known)]
+        if intervals:
+            bands.append((title, np.array([(one.value, one.low, one.high) for one in intervals])))
+    return curve_plot(name, bands, label=label, across="step", caption=caption, marks=marks)
+
+
+_, PLAIN, OTHERS, _, NEW = COLUMNS.values()
+CARDS = [
+    CardSpec(label, LINES[method], Column("", *place, metric), compare)
+    for label, method, place, metric, compare in (
+        ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
+        ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
+        ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
+        ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
+        ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
+        ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
+        ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
+        ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
+    )
+]
+
+STUDY = Study(
+    name="interpretability",
+    title="Which slot attends to which word",
+    question="Does the slot of the thing that a sentence names attend to the word that names it?",
+    sizes=lambda args: Sizes(scenes=30 if args.quick else 150, clips=10),
+    prepare=check_model,
+    units=units,
+    cases=cases,
+    rows=lambda run, found: figure_rows((one.scene.split, one.figures) for one in found["scenes"]),
+    tables=[*ATTENDS_TABLES, ENDS_TABLE],
+    page=page,
+    cards=CARDS,
+    headline=headline,
+)
 
 if __name__ == "__main__":
-    start(main, Args)
+    start(STUDY)

@@ -4,9 +4,9 @@
     python experiments/train_ablations.py --list                # what there is, and what is still to be trained
     python experiments/train_ablations.py --only layers-1 --only residual-off
 
-What is trained with which settings stands in `experiments/protocol/ablation_runs.py`. Stop it at any moment and start
-it again: finished runs are skipped, an unfinished one goes on where it was. The episodes are parsed once, and all
-predictor runs share those slots. Afterwards `python experiments/ablations.py` measures what was trained.
+What is trained with which settings stands in `experiments/ablations.py`, which measures it afterwards. Stop at any
+moment and start again: finished runs are skipped, an unfinished one goes on where it was. The episodes are parsed
+once, and all predictor runs share those slots.
 """
 
 from __future__ import annotations
@@ -15,36 +15,22 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Container, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.console import Console
 
-from experiments.protocol.ablation_runs import (
-    PARSER_BATCH,
-    PARSER_CLIP,
-    PARSER_STEPS,
-    PREDICTOR_BATCH,
-    PREDICTOR_STEPS,
-    RUNS,
-    AblationRun,
-    find_run,
-    run_named,
-)
-from experiments.reporting import Cell, Table, TableRow
-from textocvp.checkpoint import CheckpointError
+from experiments.ablations import RUNS, AblationRun, find_run, runs_table
+from textocvp.checkpoint import DEFAULT_CHECKPOINT, resolve_checkpoint
+from textocvp.data import open_episodes
 from textocvp.data.cache import cached_slots
-from textocvp.data.episodes import EpisodeFile
 from textocvp.model import TextOCVP
 from textocvp.training.parser import ParserTraining
 from textocvp.training.parser import train as train_parser
 from textocvp.training.predictor import PredictorTraining
 from textocvp.training.predictor import train as train_predictor
-from textocvp.world_model import DEFAULT_CHECKPOINT, bundled_checkpoints
 
 SLOTS = ("slots-train", "slots-val")  # as `textocvp.training.predictor` names them
 
@@ -60,14 +46,14 @@ class Args:
     out: Path = Path("runs/ablations")
     """Folder of all runs."""
     parser: str = DEFAULT_CHECKPOINT
-    """Checkpoint whose parser and renderer all predictor runs share: bundled name or folder."""
-    only: tuple[str, ...] = ()
+    """Checkpoint whose parser and renderer all predictor runs share: bundled name, folder or hub id."""
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Train only the runs of these names."""
     list: bool = False
     """Say what there is, and train nothing."""
-    steps: int = PREDICTOR_STEPS
+    steps: int = 500
     """Updates of each predictor run."""
-    parser_steps: int = PARSER_STEPS
+    parser_steps: int = 200
     """Updates of each parser run."""
     episodes: int | None = None
     """Train on the first so many episodes of the file only."""
@@ -80,80 +66,75 @@ def main(args: Args) -> int:
 
     Raises:
         KeyError: if there is no run of a name in `args.only`.
-        OSError, ValueError: if the episodes cannot be read.
-        CheckpointError: if there is no such parser.
+        OSError, ValueError: if the episodes cannot be read, or there is no such parser.
     """
-    console = Console()
-    chosen = [run_named(name) for name in args.only] or list(RUNS)
-    if args.list:
-        console.print(states_table(chosen, args.out).to_rich())
-        return 0
-    for path in (args.data, args.val):
-        EpisodeFile(path).close()
-    failed: dict[str, str] = {}
-    with ExitStack() as stack:
-        parser = parser_folder(args.parser, stack)
-        for number, run in enumerate(chosen, start=1):
-            heading = f"{run.name} ({number} of {len(chosen)}): {run.label}"
-            found = find_run(run, args.out)
-            if found.state == "trained":
-                console.print(f"{heading}: trained already", highlight=False)
-                continue
-            console.rule(heading)
-            began = time.monotonic()
-            try:
-                if found.state == "other settings":
-                    raise ValueError(f"{found.folder} holds a run with other settings: {found.detail}")
-                train(run, args, parser)
-            except (ValueError, RuntimeError, OSError, ImportError) as error:
-                # One encoder that cannot be had here must not cost the night's other runs.
-                failed[run.name] = str(error)
-                console.print(f"[red]{run.name} failed:[/] {error}", highlight=False)
-            else:
-                console.print(f"{run.name}: {time.monotonic() - began:.0f} s", highlight=False)
-    console.print(states_table(chosen, args.out, failed).to_rich())
+    console, failed = Console(), dict[str, str]()
+    chosen = [run_named(name) for name in args.only] or RUNS
+    if not args.list:
+        for path in (args.data, args.val):
+            open_episodes(path).close()
+        with resolve_checkpoint(args.parser) as parser:
+            for number, run in enumerate(chosen, start=1):
+                heading = f"{run.key} ({number} of {len(chosen)}): {run.label}"
+                found = find_run(run, args.out)
+                if found.state == "trained":
+                    console.print(f"{heading}: trained already", highlight=False)
+                    continue
+                console.rule(heading)
+                began = time.monotonic()
+                try:
+                    if found.state == "other settings":
+                        raise ValueError(f"{found.folder} holds a run with other settings: {found.detail}")
+                    train(run, args, parser)
+                except (ValueError, RuntimeError, OSError, ImportError) as error:
+                    # One encoder that cannot be had here must not cost the night's other runs.
+                    failed[run.key] = str(error)
+                    console.print(f"[red]{run.key} failed:[/] {error}", highlight=False)
+                else:
+                    console.print(f"{run.key}: {time.monotonic() - began:.0f} s", highlight=False)
+    table = runs_table((find_run(run, args.out) for run in chosen), failed)
+    console.print(*table.to_terminal(console.width))
     for name, problem in failed.items():
         console.print(f"{name}: {problem}", highlight=False)
     return 1 if failed else 0
 
 
+def run_named(name: str) -> AblationRun:
+    """The run of that name.
+
+    Raises:
+        KeyError: if there is none; the message lists those that exist.
+    """
+    runs = {run.key: run for run in RUNS}
+    if name not in runs:
+        raise KeyError(f"unknown run {name!r}; known: {', '.join(runs)}")
+    return runs[name]
+
+
 def train(run: AblationRun, args: Args, parser: Path) -> None:
-    """Train one run, or go on with it."""
-    out = args.out / run.name
+    """Train one run, or go on with it. All runs of a stage learn from the same episodes in the same order."""
+    out = args.out / run.key
+    shared: dict[str, Any] = {"data": args.data, "val": args.val, "out": out, "seed": args.seed}
+    shared |= {"preset": run.preset, "set": run.settings}
     if run.stage == "parser":
+        steps, episodes = args.parser_steps, args.episodes or ParserTraining.episodes
+        warmup = min(ParserTraining.warmup, steps // 4)
         train_parser(
-            ParserTraining(
-                data=args.data,
-                val=args.val,
-                out=out,
-                preset=run.preset,
-                set=run.settings,
-                steps=args.parser_steps,
-                batch=PARSER_BATCH,
-                clip=PARSER_CLIP,
-                warmup=min(ParserTraining.warmup, args.parser_steps // 4),
-                episodes=args.episodes or ParserTraining.episodes,
-                seed=args.seed,
+            ParserTraining(**shared, steps=steps, batch=16, clip=2, warmup=warmup, episodes=episodes)
+        )
+    else:
+        share_slots(parser, args, out)
+        train_predictor(
+            PredictorTraining(
+                **shared,
+                parser=parser,
+                episodes=args.episodes,
+                steps=args.steps,
+                batch=32,
+                warmup=min(PredictorTraining.warmup, args.steps // 4),
+                autoregressive=1.0,
             )
         )
-        return
-    share_slots(parser, args, out)
-    train_predictor(
-        PredictorTraining(
-            parser=parser,
-            data=args.data,
-            val=args.val,
-            out=out,
-            preset=run.preset,
-            set=run.settings,
-            episodes=args.episodes,
-            steps=args.steps,
-            batch=PREDICTOR_BATCH,
-            warmup=min(PredictorTraining.warmup, args.steps // 4),
-            autoregressive=1.0,
-            seed=args.seed,
-        )
-    )
 
 
 def share_slots(parser: Path, args: Args, out: Path) -> None:
@@ -162,11 +143,10 @@ def share_slots(parser: Path, args: Args, out: Path) -> None:
     Raises:
         CacheError: if the shared slots are those of another parser or of other episodes.
     """
-    shared = args.out / "slots"
-    model = TextOCVP.from_pretrained(parser)
+    shared, model = args.out / "slots", TextOCVP.from_pretrained(parser)
     out.mkdir(parents=True, exist_ok=True)
     for name, path, first in zip(SLOTS, (args.data, args.val), (args.episodes, None), strict=True):
-        with EpisodeFile(path, first=first) as episodes:
+        with open_episodes(path, first=first) as episodes:
             cached_slots(model, episodes, shared / name)
         shutil.rmtree(out / name, ignore_errors=True)
         shutil.copytree(shared / name, out / name, copy_function=_link)
@@ -179,38 +159,12 @@ def _link(source: str, target: str) -> None:
         shutil.copyfile(source, target)
 
 
-def parser_folder(name: str, stack: ExitStack) -> Path:
-    """The folder of a checkpoint, which stays there while `stack` is open.
-
-    Raises:
-        CheckpointError: if there is no such checkpoint.
-    """
-    if name in bundled_checkpoints():
-        return stack.enter_context(as_file(files("textocvp") / "checkpoints" / name))
-    if not Path(name).is_dir():
-        raise CheckpointError(
-            f"unknown checkpoint {name!r}: give a folder, or one of {', '.join(bundled_checkpoints())}"
-        )
-    return Path(name)
-
-
-def states_table(runs: Sequence[AblationRun], out: Path, failed: Container[str] = ()) -> Table:
-    """What there is of each run."""
-    lines = []
-    for run in runs:
-        found = find_run(run, out)
-        state = "failed" if run.name in failed else found.state
-        updates = Cell("" if found.updates is None else f"{found.updates}")
-        lines.append(TableRow(run.name, [Cell(run.stage), Cell(state), updates]))
-    return Table(f"Runs in {out}", ["stage", "state", "updates"], lines)
-
-
 if __name__ == "__main__":
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyError as error:
         sys.exit(f"error: {error.args[0]}")
-    except (OSError, CheckpointError, ValueError) as error:
+    except (OSError, ValueError) as error:  # CheckpointError is a ValueError
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("stopped; start it again to go on")

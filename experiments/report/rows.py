@@ -93,3 +93,18 @@ def pick_figures(rows: Iterable[Row], wanted: Mapping[str, Key]) -> dict[str, fl
     """The figures of these names, rounded to 4 digits; those that were not measured are left out."""
     found = by_key(rows)
     return {name: round(found[key].value, 4) for name, key in wanted.items() if key in found}
+
+
+def figure_rows(scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]]) -> list[Row]:
+    """A row for each figure of each split: of truth values a rate, of numbers a mean.
+
+    Args:
+        scenes: the split of each and its figures: (method, variant, metric) -> a number, or one or more truth values.
+    """
+    values: dict[Key, list[Any]] = {}
+    for split, figures in scenes:
+        for (method, variant, metric), value in figures.items():
+            values.setdefault((method, split, variant, metric), []).append(value)
+    return [
+        (rate_row if np.asarray(its).dtype == bool else mean_row)(*key, its) for key, its in values.items()
+    ]

@@ -4,21 +4,29 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import textocvp
-from experiments.ablations import Args, Sizes, look, main
-from experiments.protocol.ablation_report import predictor_plot, predictor_table
-from experiments.protocol.ablation_rows import following_rows, parsing_rows, slots_name
-from experiments.protocol.ablation_runs import find_run, run_named
-from experiments.protocol.ablation_scenes import (
-    Followed,
-    FollowingOutcome,
-    Parsed,
-    ParsingOutcome,
+from envs.colors import COLORS
+from experiments.ablations import (
+    PREDICTORS,
+    STUDY,
+    Args,
+    Entrant,
+    FollowingScene,
+    Outcome,
+    Sizes,
+    find_run,
+    following_plot,
+    look,
+    predictor_table,
+    slots_name,
 )
-from experiments.protocol.scenes import test_scenes
+from experiments.report.rows import Row, figure_rows
+from experiments.study.pool import Worker
+from experiments.study.run import run
+from experiments.study.scenes import study_scenes
+from tests.experiments.oracle import LoadOracle
 
 SHIPPED = Path(textocvp.__file__).parent / "checkpoints" / "tabletop-small"
 
@@ -40,18 +48,27 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
     args = Args(out=out, runs=runs, quick=True, workers=1)
-    main(args, sizes=Sizes(following=2, unseen=1, acted=1, parsing=1, slots=1, clips=1), slot_counts=(4, 12))
+    sizes = Sizes(following=2, unseen=1, acted=1, parsing=1, slots=1, clips=1, slot_counts=(4, 12))
+    run(STUDY, args, sizes=sizes)
     return out
 
 
 def test_what_there_is_of_every_run(runs: Path) -> None:
     found, hashes = look(runs)
-    states = {one.run.name: one.state for one in found}
-    assert states.pop("base") == "trained" and find_run(run_named("base"), runs).updates == 123
+    states = {one.run.key: one.state for one in found}
+    assert states.pop("base") == "trained" and find_run(PREDICTORS[0], runs).updates == 123
     assert states.pop("layers-1") == "other settings"
-    assert states.pop("layers-2") == "unfinished"
-    assert set(states.values()) == {"missing"}
+    assert states.pop("layers-2") == "not finished"
+    assert set(states.values()) == {"not trained"}
     assert list(hashes) == ["base"] and len(hashes["base"]) == 16
+
+
+def test_figures_of_episodes_without_masks_count_too(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs / "base", tmp_path / "base")
+    (tmp_path / "base" / "following.json").rename(tmp_path / "base" / "slot_errors.json")
+    assert find_run(PREDICTORS[0], tmp_path).state == "trained"
+    (tmp_path / "base" / "slot_errors.json").unlink()
+    assert find_run(PREDICTORS[0], tmp_path).state == "not finished"
 
 
 def test_figures_of_what_is_there(results: Path) -> None:
@@ -76,30 +93,37 @@ def test_figures_of_what_is_there(results: Path) -> None:
 
 def test_the_page_says_what_is_missing_and_how_to_train_it(results: Path) -> None:
     page = (results / "report.html").read_text()
-    assert page.count("not trained") >= 4 and "--only text-minilm" in page
+    assert page.count("not trained; train it: ") == 9 and "--only text-minilm" in page
     assert "predictor.layers is 3, wanted 1" in page and "not finished" in page
     assert "of 123 updates" in page
     assert (results / "plots" / "following.png").is_file() and (results / "plots" / "slots.png").is_file()
 
 
+def outcomes(figures: list[dict]) -> list[Row]:
+    """Rows of scenes with these figures of `base`."""
+    scenes = [
+        Outcome(scene, {("base", *names): value for names, value in its.items()})
+        for scene, its in zip(study_scenes("controllability", len(figures), 0), figures, strict=True)
+    ]
+    return figure_rows((one.scene.split, one.figures) for one in scenes)
+
+
 def test_rows_count_scenes() -> None:
-    scenes = test_scenes("controllability", 2, 0)
-    outcomes = [
-        FollowingOutcome(
-            scene,
-            (),
-            {"base": Followed(np.array(own), np.array(own) | True, np.array(wrong), {"psnr": 20.0 + i})},
-        )
-        for i, (scene, own, wrong) in enumerate(
-            zip(
-                scenes,
-                ([True, True, False], [False, True, True]),
-                ([False] * 3, [True, False, False]),
-                strict=True,
-            )
+    made = [
+        {
+            ("original", "predicted_success"): own[0],
+            ("variants mean", "predicted_success"): own[1:],
+            ("original", "ends_within_6_px"): True,
+            ("variants mean", "ends_within_6_px"): [True, True],
+            ("wrong text", "ends_within_6_px"): wrong,
+            ("9 frames", "psnr"): psnr,
+        }
+        for own, wrong, psnr in (
+            ([True, True, False], [False] * 3, 20.0),
+            ([False, True, True], [True, False, False], 21.0),
         )
     ]
-    rows = {(row.variant, row.metric): row for row in following_rows(outcomes)}
+    rows = {(row.variant, row.metric): row for row in outcomes(made)}
     assert rows["original", "predicted_success"].value == 0.5
     assert rows["variants mean", "predicted_success"].value == 0.75
     assert (
@@ -108,28 +132,41 @@ def test_rows_count_scenes() -> None:
     assert rows["wrong text", "ends_within_6_px"].value == pytest.approx(1 / 6)
     assert rows["9 frames", "psnr"].value == 20.5
     assert {row.n for row in rows.values()} == {2}
-    parsed = [ParsingOutcome(scene, {"savi-cluster": Parsed(0.5, 0.4, 0.3, 20.0)}) for scene in scenes]
-    assert {row.metric: row.value for row in parsing_rows(parsed)} == {
-        "miou": 0.5,
-        "kept": 0.4,
-        "ari": 0.3,
-        "psnr": 20,
+    assert (
+        rows["wrong text", "ends_within_6_px"].low > 0
+    )  # a rate has Wilson's interval, a mean a bootstrap's
+    assert (rows["9 frames", "psnr"].low, rows["9 frames", "psnr"].high) == (20.0, 21.0)
+
+
+def test_a_scene_is_followed_by_a_model_that_is_always_right_and_by_one_that_never_is() -> None:
+    (scene,) = study_scenes("controllability", 1, 0)
+    stubborn = LoadOracle((*COLORS,))
+    who = (Entrant("right"), Entrant("stubborn", stubborn))
+    figures = FollowingScene(scene, who, 3, 0).run(Worker(LoadOracle()())).figures
+    for metric in ("predicted_success", "ends_within_6_px"):
+        for name, good in (("right", True), ("stubborn", False)):
+            assert figures[name, "original", metric] == good
+            assert figures[name, "variants mean", metric].tolist() == [good] * 3
+    assert figures["right", "wrong text", "ends_within_6_px"].tolist() == [False] * 4
+    assert set(FollowingScene(scene, who[:1], 0, 0).run(Worker(LoadOracle()())).figures) == {
+        ("right", "original", "predicted_success"),
+        ("right", "original", "ends_within_6_px"),
     }
 
 
 def test_the_plot_shows_the_columns_that_it_names(runs: Path) -> None:
-    found, _ = look(runs)
-    outcomes = [
-        FollowingOutcome(
-            scene, (), {"base": Followed(np.zeros(2, bool), np.ones(2, bool), np.zeros(2, bool), {})}
-        )
-        for scene in test_scenes("controllability", 2, 0)
-    ]
-    (figure,) = predictor_plot(following_rows(outcomes), found)
+    reached = {("original", "ends_within_6_px"): True, ("variants mean", "ends_within_6_px"): [True]}
+    (figure,) = following_plot(outcomes([reached] * 2), look(runs)[0])
     assert "original: base 1.00" in figure.alt and "three other bowls: base 1.00" in figure.alt
 
 
 def test_a_table_without_any_figure_is_a_table(tmp_path: Path) -> None:
-    found, _ = look(tmp_path)
-    table = predictor_table([], found, "text")
-    assert [row.cells[0].text for row in table.rows] == ["\u2013", *["not trained"] * 4, "\u2013", "\u2013"]
+    runs = [one.line for one in look(tmp_path)[0] if one.run.group in ("reference", "text")]
+    table = predictor_table("Text encoder", runs).table([])
+    assert {cell.text for row in table.rows for cell in row.cells} == {"\u2013"}
+    assert [row.note.split(";")[0] == "not trained" for row in table.rows] == [
+        False,
+        *[True] * 4,
+        False,
+        False,
+    ]

@@ -6,41 +6,39 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tyro
 
 import experiments.train_ablations as training
-from experiments.protocol.ablation_runs import (
-    PARSER_RUNS,
-    PREDICTOR_RUNS,
-    RUNS,
-    AblationRun,
-    differences,
-    find_run,
-    run_named,
-)
-from experiments.train_ablations import Args, main
+from experiments.ablations import PARSERS, PREDICTORS, RUNS, AblationRun, differences, find_run
+from experiments.train_ablations import Args, main, run_named
 from tests.textocvp.conftest import PLACED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.checkpoint import read_config
 from textocvp.presets import PRESETS
 
+
+def tiny(key: str, label: str, *settings: str, stage: str = "predictor") -> AblationRun:
+    return AblationRun(
+        key=key, label=label, stage=stage, group="depth", preset="tiny-placed", settings=settings
+    )
+
+
 TINY = (
-    AblationRun("base", "predictor", "reference", "as it is", "tiny-placed"),
-    AblationRun(
-        "broken", "predictor", "depth", "cannot be built", "tiny-placed", ("text.kind=transformer",) * 2
-    ),
-    AblationRun("layers-1", "predictor", "depth", "1 layer", "tiny-placed", ("predictor.layers=1",)),
-    AblationRun("parser", "parser", "initializer and decoder", "parser", "tiny-placed"),
+    tiny("base", "as it is"),
+    tiny("broken", "cannot be built", *("text.kind=transformer",) * 2),
+    tiny("layers-1", "1 layer", "predictor.layers=1"),
+    tiny("parser", "parser", stage="parser"),
 )
 
 
 def test_every_run_is_a_model_of_its_own() -> None:
-    assert len({run.name for run in RUNS}) == len(RUNS)
-    assert {run.stage for run in PREDICTOR_RUNS} == {"predictor"}
-    assert {run.stage for run in PARSER_RUNS} == {"parser"}
-    for runs in (PREDICTOR_RUNS, PARSER_RUNS):
+    assert len({run.key for run in RUNS}) == len(RUNS)
+    assert {run.stage for run in PREDICTORS} == {"predictor"}
+    assert {run.stage for run in PARSERS} == {"parser"}
+    for runs in (PREDICTORS, PARSERS):
         for run in runs:
             for other in runs:
-                assert bool(differences(run, other.config)) == (run is not other), (run.name, other.name)
+                assert bool(differences(run, other.config)) == (run is not other), (run.key, other.key)
 
 
 def test_differences_are_named() -> None:
@@ -59,7 +57,7 @@ def test_where_pretrained_weights_came_from_is_no_difference() -> None:
 def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Args:
     monkeypatch.setitem(PRESETS, "tiny-placed", PLACED)
     monkeypatch.setattr(training, "RUNS", TINY)
-    monkeypatch.setattr(training, "run_named", {run.name: run for run in TINY}.__getitem__)
+    monkeypatch.setattr(training, "run_named", {run.key: run for run in TINY}.__getitem__)
     build(PLACED).save_pretrained(tmp_path / "shipped")
     write_toy_episodes(tmp_path / "train.h5", [9, 8, 9, 9])
     write_toy_episodes(tmp_path / "val.h5", [9, 9], seed=1)
@@ -69,8 +67,8 @@ def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Args:
 
 def test_one_command_trains_all_and_tells_what_failed(args: Args, capsys: pytest.CaptureFixture) -> None:
     assert main(args) == 1  # `broken`: the colour bias needs the lexicon
-    states = {run.name: find_run(run, args.out).state for run in TINY}
-    assert states == {"base": "trained", "broken": "missing", "layers-1": "trained", "parser": "trained"}
+    states = {run.key: find_run(run, args.out).state for run in TINY}
+    assert states == {"base": "trained", "broken": "not trained", "layers-1": "trained", "parser": "trained"}
     assert "broken failed" in capsys.readouterr().out
     assert read_config(args.out / "layers-1" / "checkpoint").predictor.layers == 1
     assert find_run(TINY[0], args.out).updates == 2
@@ -101,8 +99,12 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(
     assert "predictor.layers is 2, wanted 1" in capsys.readouterr().out
 
 
+def test_several_runs_can_be_named() -> None:
+    assert tyro.cli(Args, args=["--only", "base", "--only", "layers-1"]).only == ("base", "layers-1")
+
+
 def test_nothing_is_trained_when_only_asked(args: Args, capsys: pytest.CaptureFixture) -> None:
     args.list = True
     assert main(args) == 0
-    assert capsys.readouterr().out.count("missing") == len(TINY)
+    assert capsys.readouterr().out.count("not trained") == len(TINY)
     assert not args.out.exists()

@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import controllability, objects, prediction, robustness
+from experiments import ablations, controllability, interpretability, long_horizon, objects, prediction, robustness, runtime
 from experiments.report.plots import plot_table
 from experiments.report.rows import Row
 from experiments.report.tables import DASH, Cell, Column, Line, Paper, Table, TableRow, TableSpec, columns
@@ -113,9 +113,12 @@ def every_row(spec: TableSpec) -> list[Row]:
     ]
 
 
+STUDIES = (ablations, controllability, interpretability, long_horizon, objects, prediction, robustness, runtime)
+
+
 @pytest.mark.parametrize(
     "spec",
-    [spec for study in (controllability, objects, prediction, robustness) for spec in study.STUDY.tables],
+    [spec for study in STUDIES for spec in study.STUDY.tables],
     ids=lambda s: s.title,
 )
 @pytest.mark.parametrize("width", [80, 120])

@@ -14,30 +14,30 @@ from tests.experiments import oracle
 from tests.planning.oracle import BLOCK, BOWL
 from textocvp.rollout import Rollout
 
-Kind = Literal["listens", "deaf", "swapped", "one head", "late"]
+Kind = Literal["attends", "uniform", "swapped", "one head", "late"]
 LAYERS, HEADS = 2, 3
 
 
 @dataclass(frozen=True)
-class LoadListener:
+class LoadAttentive:
     """Makes the double.
 
     Attributes:
-        kind: `listens`: the named block's slot gives .9 of its attention to its colour word, the named bowl's slot
-            to its own, and all others the same share to every word. `deaf`: all slots are like those others.
-            `swapped`: block and bowl listen to each other's word. `one head`: only layer 2, head 3 listens.
-            `late`: it listens from step 12 on.
+        kind: `attends`: the named block's slot gives .9 of its attention to its colour word, the named bowl's slot
+            to its own, and all others the same share to every word. `uniform`: all slots are like those others.
+            `swapped`: block and bowl attend to each other's word. `one head`: only layer 2, head 3 attends.
+            `late`: it attends from step 12 on.
     """
 
     kind: Kind
 
-    def __call__(self) -> Listener:
+    def __call__(self) -> Attentive:
         oracle._listen()
-        return Listener(self.kind)
+        return Attentive(self.kind)
 
 
-class Listener(oracle.StudyOracle):
-    """See `LoadListener`."""
+class Attentive(oracle.StudyOracle):
+    """See `LoadAttentive`."""
 
     def __init__(self, kind: Kind) -> None:
         super().__init__(())
@@ -59,20 +59,20 @@ class Listener(oracle.StudyOracle):
         maps = [self._attend(rollout.slots[b, 0], Instruction.parse(t), horizon) for b, t in enumerate(text)]
         return replace(rollout, attention=torch.stack(maps) if attention else None)
 
-    def _attend(self, slots_KD: torch.Tensor, told: Instruction, steps: int) -> torch.Tensor:
-        block = self._oracle()._find(slots_KD, BLOCK, told.block)
-        bowl = self._oracle()._find(slots_KD, BOWL, told.bowl)
+    def _attend(self, slots_KD: torch.Tensor, asked: Instruction, steps: int) -> torch.Tensor:
+        block = self._oracle()._find(slots_KD, BLOCK, asked.thing.color)
+        bowl = self._oracle()._find(slots_KD, BOWL, asked.target.color)
         map_TnhKL = torch.full((steps, LAYERS, HEADS, len(slots_KD), 9), 1 / 9)
-        if self.kind == "deaf":
+        if self.kind == "uniform":
             return map_TnhKL
         words = (6, 2) if self.kind == "swapped" else (2, 6)
-        listening = torch.zeros(steps, LAYERS, HEADS, dtype=torch.bool)
+        attending = torch.zeros(steps, LAYERS, HEADS, dtype=torch.bool)
         if self.kind == "one head":
-            listening[:, 1, 2] = True
+            attending[:, 1, 2] = True
         else:
-            listening[12 if self.kind == "late" else 0 :] = True
+            attending[12 if self.kind == "late" else 0 :] = True
         for slot, word in zip((block, bowl), words, strict=True):
             attentive_L = torch.full((9,), 0.1 / 8)
             attentive_L[word] = 0.9
-            map_TnhKL[..., slot, :] = torch.where(listening[..., None], attentive_L, map_TnhKL[..., slot, :])
+            map_TnhKL[..., slot, :] = torch.where(attending[..., None], attentive_L, map_TnhKL[..., slot, :])
         return map_TnhKL
