@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from envs.tabletop import PutBlockInBowl
+from envs.tabletop import TabletopEnv
 from planning import PinholeCamera
 from tests.planning.oracle import ARM, OracleWorldModel
 from textocvp.rollout import Rollout
@@ -23,21 +23,21 @@ _history: list[dict[str, Any]] = []
 
 
 def _listen() -> None:
-    if getattr(PutBlockInBowl, "_heard", False):
+    if getattr(TabletopEnv, "_heard", False):
         return
-    reset, step = PutBlockInBowl.reset, PutBlockInBowl.step
+    reset, step = TabletopEnv.reset, TabletopEnv.step
 
-    def heard_reset(self: PutBlockInBowl, *, seed: int | None = None, options: Any = None) -> Any:
+    def heard_reset(self: TabletopEnv, *, seed: int | None = None, options: Any = None) -> Any:
         result = reset(self, seed=seed, options=options)
         _history[:] = [result[1]]
         return result
 
-    def heard_step(self: PutBlockInBowl, action: Any) -> Any:
+    def heard_step(self: TabletopEnv, action: Any) -> Any:
         result = step(self, action)
         _history.append(result[-1])
         return result
 
-    PutBlockInBowl.reset, PutBlockInBowl.step, PutBlockInBowl._heard = heard_reset, heard_step, True  # type: ignore
+    TabletopEnv.reset, TabletopEnv.step, TabletopEnv._heard = heard_reset, heard_step, True  # type: ignore
 
 
 @dataclass(frozen=True)
