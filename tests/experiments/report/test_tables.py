@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import controllability, robustness
+from experiments import controllability, long_horizon, robustness
 from experiments.report.plots import plot_table
 from experiments.report.rows import Row
 from experiments.report.tables import DASH, Cell, Column, Line, Paper, Table, TableRow, TableSpec, columns
@@ -114,7 +114,9 @@ def every_row(spec: TableSpec) -> list[Row]:
 
 
 @pytest.mark.parametrize(
-    "spec", [*controllability.STUDY.tables, *robustness.STUDY.tables], ids=lambda s: s.title
+    "spec",
+    [spec for study in (controllability, long_horizon, robustness) for spec in study.STUDY.tables],
+    ids=lambda spec: spec.title,
 )
 @pytest.mark.parametrize("width", [80, 120])
 def test_no_figure_is_cut_off(spec: TableSpec, width: int) -> None:
