@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import controllability, long_horizon, robustness
+from experiments import controllability, long_horizon, robustness, runtime
 from experiments.report.plots import plot_table
 from experiments.report.rows import Row
 from experiments.report.tables import DASH, Cell, Column, Line, Paper, Table, TableRow, TableSpec, columns
@@ -115,7 +115,7 @@ def every_row(spec: TableSpec) -> list[Row]:
 
 @pytest.mark.parametrize(
     "spec",
-    [spec for study in (controllability, long_horizon, robustness) for spec in study.STUDY.tables],
+    [spec for study in (controllability, long_horizon, robustness, runtime) for spec in study.STUDY.tables],
     ids=lambda spec: spec.title,
 )
 @pytest.mark.parametrize("width", [80, 120])

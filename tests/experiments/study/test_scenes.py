@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from planning import Goal
 from experiments.controllability import LOOP_PLACES
 from experiments.study.scenes import play_expert, sample_scene, study_scenes
+from planning import Goal
 
 
 @pytest.fixture(scope="module")
