@@ -16,7 +16,7 @@ import shlex
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -57,12 +57,10 @@ class Args(StudyArgs):
         return study.args(out=self.folder("") / study.name, **{name: getattr(self, name) for name in known})
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a study in this run."""
-
-    state: str  # `done` now, `kept` from an earlier run, `failed`, or `not run`
-    problem: str = ""  # what went wrong
+Outcome = tuple[str, Tone, str]
+"""Of a study in this run: a word or two, their colour on the page, and what went wrong."""
+DONE: Outcome = ("done", "good", "")
+NOT_RUN: Outcome = ("not run", "plain", "")
 
 
 def main(
@@ -90,11 +88,11 @@ def main(
         raise UsageError(f"unknown study {wrong[0]!r}; known: {', '.join(known)}")
     folder, console = OutputFolder(args.folder("")), Console()
     where = (load or LoadCheckpoint(args.checkpoint))().checkpoint
-    outcomes = {study.name: Outcome("not run") for study in studies}
+    outcomes: dict[str, Outcome] = dict.fromkeys(known, NOT_RUN)
     for study in studies:
-        kept, wanted = is_done(study, args.of(study), load), not args.only or study.name in args.only
-        if kept and not (wanted and args.fresh):
-            outcomes[study.name] = Outcome("kept")
+        wanted = not args.only or study.name in args.only
+        if not (wanted and args.fresh) and is_done(study, args.of(study), load):
+            outcomes[study.name] = DONE
         elif wanted:
             console.rule(study.title)
             # Until it is done again, nothing is known of what lies there.
@@ -102,26 +100,12 @@ def main(
             problem = (execute or run_program)(study, args.of(study))
             if not problem and not is_done(study, args.of(study), load):
                 problem = "it ended well, but its results.json is not there or of another checkpoint"
-            outcomes[study.name] = Outcome("failed" if problem else "done", problem)
-        console.print(f"{study.name}: {outcomes[study.name].state}", highlight=False)
+            outcomes[study.name] = ("failed", "bad", problem) if problem else DONE
+        console.print(f"{study.name}: {outcomes[study.name][0]}", highlight=False)
         # After every study, so that there is something to look at while the next one runs.
-        with folder.fill() as partial:
-            found = {one.name: read_results(folder.path / one.name) for one in studies}
-            entries = [entry_of(one, outcomes[one.name], found[one.name]) for one in studies]
-            index = Index(
-                title="What was measured",
-                text="Every study has a page of its own, which opens offline: tables with 95 % intervals, plots, clips "
-                "of the best and of the worst cases, and the command that gives the same figures again.",
-                entries=entries,
-                checkpoint=Checkpoint(where.name, where.sha256),
-                command=replace(args, only=(), fresh=False).command("all"),
-                quick=args.quick,
-            )
-            (partial / "index.html").write_text(index.to_html(), encoding="utf-8")
-            parts = [to_markdown(one, results) for one in studies if (results := found[one.name])]
-            (partial / "summary.md").write_text("\n".join(parts), encoding="utf-8")
+        write_pages(folder, args, Checkpoint(where.name, where.sha256), studies, outcomes)
     console.print(f"Index: {folder.path / 'index.html'}", highlight=False)
-    return int(any(outcome.state == "failed" for outcome in outcomes.values()))
+    return int(any(problem for *_, problem in outcomes.values()))
 
 
 def is_done(study: Study, args: StudyArgs, load: LoadModel | None = None) -> bool:
@@ -162,35 +146,60 @@ def run_program(study: Study, args: StudyArgs) -> str:
     return "\n".join([f"exit status {program.returncode}", *last]) if program.returncode else ""
 
 
+def write_pages(
+    folder: OutputFolder,
+    args: Args,
+    checkpoint: Checkpoint,
+    studies: Sequence[Study],
+    outcomes: Mapping[str, Outcome],
+) -> None:
+    """`index.html` and `summary.md`, of all results that are there."""
+    entries, parts = [], []
+    for study in studies:
+        results = read_results(folder.path / study.name)
+        entries.append(entry_of(study, outcomes[study.name], results))
+        parts += [to_markdown(study, results)] if results else []
+    index = Index(
+        title="What was measured",
+        text="Every study has a page of its own, which opens offline: tables with 95 % intervals, plots, clips of the "
+        "best and of the worst cases, and the command that gives the same figures again.",
+        entries=entries,
+        checkpoint=checkpoint,
+        command=replace(args, only=(), fresh=False).command("all"),
+        quick=args.quick,
+    )
+    with folder.fill() as partial:
+        (partial / "index.html").write_text(index.to_html(), encoding="utf-8")
+        (partial / "summary.md").write_text("\n".join(parts), encoding="utf-8")
+
+
 def entry_of(study: Study, outcome: Outcome, results: Results | None) -> Entry:
     """A study's place on the page."""
-    states: dict[str, tuple[str, Tone]] = {
-        "done": ("done", "good"),
-        "kept": ("done", "good"),
-        "failed": ("failed", "bad"),
-    }
-    word, tone = states.get(outcome.state, ("not run", "plain"))
-    entry = Entry(study.title, study.question, word, tone, "no figures yet", problem=outcome.problem)
+    word, tone, problem = outcome
     if results is None:
-        return entry
+        return Entry(study.title, study.question, word, tone, "no figures yet", problem=problem)
     names = [name for name in dict.fromkeys([*study.first, *results.headline]) if name in results.headline]
-    return replace(
-        entry,
-        state=word if word == "done" else f"{word}; figures of an earlier run",
-        detail=f"{len(results.rows)} figures in {results.seconds:.0f} s{', a quick run' * results.quick}, "
-        f"{results.checkpoint.name}",
+    detail = f"{len(results.rows)} figures in {results.seconds:.0f} s, {results.checkpoint.name}"
+    return Entry(
+        title=study.title,
+        question=study.question,
+        state=word if outcome == DONE else f"{word}; figures of an earlier run",
+        tone=tone,
+        detail=detail + (", a quick run" if results.quick else ""),
         figures=[(name.replace("_", " "), f"{results.headline[name]:.3g}") for name in names[:SHOWN]],
         report=f"{study.name}/report.html",
+        problem=problem,
     )
 
 
 def to_markdown(study: Study, results: Results) -> str:
     """A study's part of the summary: its tables, or its headline figures where none of the tables has a row."""
-    tables = [table for spec in study.tables if (table := spec.table(results.rows)).measured()[1]]
-    named = [TableRow(n.replace("_", " "), [Cell(f"{value:g}")]) for n, value in results.headline.items()]
-    lines = [f"### {study.title}", ""]
-    for table in tables or [Table("Figure", ["value"], named)]:
-        lines += [table.to_markdown(), ""]
+    named = [
+        TableRow(name.replace("_", " "), [Cell(f"{value:g}")]) for name, value in results.headline.items()
+    ]
+    tables = [spec.table(results.rows) for spec in study.tables]
+    shown = [table for table in tables if table.measured()[1]] or [Table("Figure", ["value"], named)]
+    lines = [f"### {study.title}", *(f"\n{table.to_markdown()}" for table in shown), ""]
     quick = "**Quick run**: a first look, not the figures to quote. " if results.quick else ""
     lines.append(
         f"{quick}`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), 95 % intervals in brackets."
