@@ -26,7 +26,7 @@ from experiments.report.results import Results
 from experiments.report.rows import Row, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import PredictionClip, episode_clips
-from experiments.study.closed_loop import LoopEpisode, LoopOutcome
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds
 from experiments.study.judge import Verdicts, find_things, first_frame, judge, stack, trace
 from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
@@ -354,25 +354,12 @@ DETAILS_TABLE = TableSpec(
 )  # fmt: skip
 
 
-def timings(outcomes: Sequence[LoopOutcome]) -> dict[str, dict[str, float]]:
-    """Mean planning seconds, method -> column -> seconds."""
-    seconds: dict[str, dict[str, list[float]]] = {}
-    for o in outcomes:
-        if o.planning_seconds is not None:
-            its = seconds.setdefault(o.episode.method, {})
-            its.setdefault(column_of(o.episode), []).append(o.planning_seconds)
-    return {
-        method: {title: round(float(np.mean(its)), 3) for title, its in table.items()}
-        for method, table in seconds.items()
-    }
-
-
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     limits, figures = THRESHOLDS, list(results.rows)
     seconds = [
         Row("ours", *LOOP_PLACES[title], "seconds", value, value, value, 1)
-        for title, value in timings(_loop(found)).get("ours", {}).items()
+        for title, value in planning_seconds(_loop(found), column_of).get("ours", {}).items()
     ]
     pictures = found["pictures"]
     imagined = [clip for clip in pictures if clip.name.startswith("predicted")]
@@ -508,7 +495,9 @@ STUDY = Study(
         "closed_loop_variants_mean",
     ),
     # Times are not in results.json, which must come out the same when a study is repeated.
-    files=lambda run, found: {"timings.json": json.dumps(timings(_loop(found)), indent=2) + "\n"},
+    files=lambda run, found: {
+        "timings.json": json.dumps(planning_seconds(_loop(found), column_of), indent=2) + "\n"
+    },
 )
 
 if __name__ == "__main__":

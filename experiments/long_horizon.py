@@ -15,200 +15,312 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
-from experiments.protocol.arguments import StudyArgs, UsageError, start
-from experiments.protocol.figures import mean_row, rate_row
-from experiments.protocol.long_goals import (
-    LONG_COLUMNS,
-    METHODS,
-    TAKEN,
-    LongColumn,
-    LongEpisode,
-    LongMethod,
-    LongOutcome,
-    choose_long,
-    long_scenes,
+from envs import TASKS
+from envs.geometry import Sizes as ObjectSizes
+from envs.splits import SPLITS
+from experiments.report.page import CardSpec, Clips, Section
+from experiments.report.plots import plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Row, mean_row, rate_row
+from experiments.report.tables import Cell, Column, Line, TableSpec, columns
+from experiments.study.clips import episode_clips
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds
+from experiments.study.methods import HORIZON, METHODS, PLANNERS, MakePlanner, Method
+from experiments.study.pool import Unit
+from experiments.study.run import Found, FullArgs, Part, Run, Study, start
+from experiments.study.scenes import SCENES_PER_SEED, StudyScene, study_scenes
+from planning import BeamPlanner, Goal, RandomPlanner
+
+TAKEN = "bowl_taken"
+FIRST_TAKEN = 4_000  # seeds of the test split that no other study uses
+PLACES = {
+    "one step": "test", "two steps": "two_steps", "three steps": "three_steps", "bowl taken": TAKEN,
+}  # fmt: skip
+"""Columns of the tables: title (also `variant` of the rows) -> split."""
+SUCCESS = "closed_loop_success"
+
+
+# --- who chooses the steps --------------------------------------------------------------------------------------------
+
+
+def search(**options: bool) -> MakePlanner:
+    """Imagines sequences of as many steps as the goal still needs."""
+    return lambda model, goal, rng, seed: BeamPlanner(model, horizon=HORIZON, seed=seed, **options)  # type: ignore
+
+
+def draw(**options: bool) -> MakePlanner:
+    """Draws such sequences."""
+    return lambda model, goal, rng, seed: RandomPlanner(model, rng, horizon=HORIZON, seed=seed, **options)  # type: ignore
+
+
+def pair(method: Method, looking_again: str, one_plan: str) -> list[Method]:
+    """The lines of a planner, and their notes: with another look after every action, and without."""
+    again = replace(method, key=f"{method.key}, replanning", note=looking_again)
+    return [again, replace(method, key=f"{method.key}, one plan", note=one_plan, replan=False)]
+
+
+OURS = ("ours, replanning", "ours, one plan")
+NO_RULE, ANY_ORDER, ANY_STEPS = (
+    "ours without the rule, replanning",
+    "random order, one plan",
+    "random sequence, one plan",
 )
-from experiments.protocol.long_horizon_report import build_report, goals_table, success_table
-from experiments.protocol.predicted import HORIZON
-from experiments.protocol.running import StudyRun
-from experiments.protocol.workers import LoadWorldModel
-from experiments.reporting import Results, Row, StudyProgress
+EXPERT, AS_WRITTEN = "expert", "expert, order as written"
+IN_ALL_STUDIES = [METHODS[key] for key in PLANNERS if not (METHODS[key].expert or METHODS[key].privileged)]
+LINES = {
+    line.key: line
+    for line in (
+        *pair(Method(key="ours", plan=search()), "imagine sequences, do the best one's first step, look, imagine again",
+              "the first plan is carried out to its end, whatever happens"),
+        Method(key=NO_RULE, kind="control", plan=search(one_block_per_bowl=False),
+               note="not told that a bowl has room for one block: imagination alone"),
+        # Any other planner of `METHODS`; these two are here in another form.
+        *(line for one in IN_ALL_STUDIES if one.key not in ("ours", "random candidate")
+          for line in pair(one, one.note, one.note)),
+        *pair(Method(key="random order", kind="control", plan=draw(from_goal=True), chance=1),
+              "told the goal's steps; only their order is left to chance",
+              "the same, carried out without another look"),
+        *pair(Method(key="random sequence", kind="control", plan=draw()),
+              "as many random steps; drawn again after every action", "as many random steps"),
+        replace(METHODS["expert"], key=EXPERT, note="scripted, knows every pose, and empties a taken bowl first"),
+        replace(METHODS["expert"], key=AS_WRITTEN, kind="control",
+                note="the expert without thinking: shows that order matters"),
+    )
+}  # fmt: skip
+"""Who is measured, by key."""
+ONLY_TAKEN = (NO_RULE, AS_WRITTEN)  # of interest only where the order matters
+
+
+# --- units of work ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        one, two, three, taken: scenes of each column, for every method.
-        clips: how many failures and how many successes the report shows at most.
+    scenes: tuple[int, ...]  # of each column, for every method
+    clips: int  # how many failures and how many successes the report shows at most
+
+
+QUICK, DEFAULT, FULL = Sizes((4, 4, 3, 3), clips=2), Sizes((20,) * 4, clips=10), Sizes((100,) * 4, clips=10)
+
+
+def long_scenes(split: str, count: int, seed: int) -> list[StudyScene]:
+    """`count` scenes of a column; each `seed` chooses other ones."""
+    if split != TAKEN:
+        return study_scenes(split, count, seed)
+    first = SCENES_PER_SEED * seed + FIRST_TAKEN
+    return [taken_scene(SPLITS["test"].seed(first + i)) for i in range(count)]
+
+
+def taken_scene(seed: int) -> StudyScene:
+    """A scene with a goal of two steps, the second of whose blocks lies in the first one's bowl.
+
+    The sentence names them in the order that does not work: a bowl has room for one block.
     """
-
-    one: int
-    two: int
-    three: int
-    taken: int
-    clips: int
-
-    def scenes(self, column: LongColumn) -> int:
-        """How many scenes every method plays in a column."""
-        return {"test": self.one, "two_steps": self.two, "three_steps": self.three, TAKEN: self.taken}[
-            column.split
-        ]
+    task = TASKS["put_blocks_in_bowls"]
+    # Another stream than the environment's own (the bare seed) and the splits' (1).
+    scene = task.sample(np.random.default_rng([seed, 3]), task.request(2), ObjectSizes())
+    first, second = scene.goal
+    layout = []
+    for index, item in enumerate(scene.objects):
+        at = scene.objects[first.target] if index == second.thing else item
+        layout.append({"kind": item.kind, "color": item.color, "xy": (at.x, at.y), "yaw": item.yaw})
+    options = (("instruction", scene.instruction), ("layout", tuple(layout)))
+    return StudyScene(TAKEN, seed, options, steps=2)
 
 
-QUICK = Sizes(one=4, two=4, three=3, taken=3, clips=2)
-DEFAULT = Sizes(one=20, two=20, three=20, taken=20, clips=10)
-FULL = Sizes(one=100, two=100, three=100, taken=100, clips=10)
-
-
-@dataclass
-class Args(StudyArgs):
-    """Long goals in the closed loop."""
-
-    out: Path = Path("results/long_horizon")
-    """Folder for results.json, report.html, plots and clips."""
-    full: bool = False
-    """100 scenes a column; takes about an hour."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.quick and self.full:
-            raise UsageError("--quick and --full exclude each other")
+@dataclass(frozen=True)
+class LongEpisode(LoopEpisode):
+    """A unit of work: one line of the tables, one scene."""
 
     @property
-    def sizes(self) -> Sizes:
-        """How much is measured."""
-        return QUICK if self.quick else FULL if self.full else DEFAULT
+    def acts(self) -> Method:
+        """Who acts."""
+        return LINES[self.method]
+
+    def order(self, goal: Goal) -> tuple[str, ...]:
+        """What the expert does: an order that works, unless it shall keep to the sentence's."""
+        written = super().order(goal)
+        return written[::-1] if self.scene.split == TAKEN and self.method != AS_WRITTEN else written
 
 
-def main(args: Args, load: LoadWorldModel | None = None, sizes: Sizes | None = None) -> Results:
-    """Run the study and write its folder.
+def column_of(episode: LoopEpisode) -> str:
+    """Title of its column."""
+    return next(title for title, split in PLACES.items() if split == episode.scene.split)
 
-    Args:
-        args: the command line.
-        load: makes the world model; by default loads `args.checkpoint`.
-        sizes: how much is measured; by default what `args` ask for.
 
-    Raises:
-        OSError: if the folder cannot be written, before any work is done.
-        CheckpointError: if there is no such checkpoint, before any work is done.
-    """
-    run, sizes = StudyRun.open("long_horizon", args, load, HORIZON), sizes or args.sizes
-    pool = run.pool
-    episodes = {column.name: column_episodes(column, sizes, args.seed) for column in LONG_COLUMNS}
-    outcomes: list[LongOutcome] = []
-    # Rough seconds of an episode on one core; they only weigh the columns in the progress bar.
-    parts = {c.name: (len(episodes[c.name]), 1.0 * c.steps) for c in LONG_COLUMNS}
-    with StudyProgress(parts | {"pictures": (2 * sizes.clips, 4.0)}) as progress:
-        for name, units in episodes.items():
-            for outcome in progress.track(name, pool.run(units)):
-                outcomes.append(outcome)
-                if len(outcomes) % len(METHODS) == 0:
-                    progress.show(success_table(long_rows(outcomes)))
-        rows = long_rows(outcomes)
-        chosen = choose_long(outcomes, sizes.clips)
-        progress.expect("pictures", len(chosen))
-        pictures = list(progress.track("pictures", pool.run(chosen)))
-    results = run.results(rows, headline(rows), seeds_used(episodes, args.seed))
-    seconds = planning_seconds(outcomes)
-    # Times are not in results.json, which must come out the same when a study is repeated.
-    run.write(
-        build_report(results, seconds, pictures, run.command),
-        {"timings.json": json.dumps(seconds, indent=2) + "\n"},
+def units(run: Run) -> dict[str, Part]:
+    """Every episode of each column, scene by scene, so that all methods fill up together."""
+    parts = {}
+    for (title, split), count in zip(PLACES.items(), run.sizes.scenes, strict=True):
+        scenes = long_scenes(split, count, run.args.seed)
+        episodes = [
+            LongEpisode(key, scene, seed=run.args.seed)
+            for scene in scenes
+            for key in LINES
+            if split == TAKEN or key not in ONLY_TAKEN
+        ]
+        parts[title] = Part(episodes, float(scenes[0].steps if scenes else 1))
+    return {**parts, "clips": Part(seconds=4.0, count=2 * run.sizes.clips)}
+
+
+def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
+    """Episodes of ours."""
+    outcomes = [o for title in PLACES for o in found[title]]
+    return {"clips": episode_clips(outcomes, lambda e: f"{column_of(e)}, {e.method}", run.sizes.clips, OURS)}
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def rows(run: Run, found: Found) -> list[Row]:
+    """Every figure of every line and column, as far as there are outcomes."""
+    made = []
+    for key, (title, split) in product(LINES, PLACES.items()):
+        here = [o for o in found[title] if o.episode.method == key]
+        if not here:
+            continue
+        place = key, split, title
+        made.append(rate_row(*place, SUCCESS, [o.success for o in here]))
+        made.append(rate_row(*place, "subgoals_reached", [o.gained for o in here]))
+        made.append(mean_row(*place, "steps", [o.steps for o in here]))
+        if all(o.believes_reached is not None for o in here):
+            made.append(rate_row(*place, "wrong_belief", [o.believes_reached != o.success for o in here]))
+        if split == TAKEN:
+            made.append(rate_row(*place, "empties_first", [empties_first(o) for o in here]))
+    return made
+
+
+def empties_first(outcome: LoopOutcome) -> bool:
+    """Whether the first step was the one that another one's place depends on."""
+    return outcome.instructions[:1] == (Goal.parse(outcome.text).instructions[-1].text,)
+
+
+HEADLINE = {
+    f"{name}_{title.replace(' ', '_')}": (key, split, title, SUCCESS)
+    for key, name in (
+        (OURS[0], "closed_loop"), (OURS[1], "closed_loop_one_plan"), (ANY_ORDER, "random_order_one_plan"),
+        (ANY_STEPS, "random_sequence_one_plan"), (EXPERT, "expert"),
     )
-    run.close(progress, results, [success_table(rows), goals_table(rows)])
-    return results
+    for title, split in PLACES.items()
+}  # fmt: skip
 
 
-def column_episodes(column: LongColumn, sizes: Sizes, seed: int) -> list[LongEpisode]:
-    """Every episode of a column, scene by scene, so that all methods fill up together."""
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+COLUMNS = {title: (split, title) for title, split in PLACES.items()}
+GOALS = TableSpec("Whole goal reached", columns(SUCCESS, COLUMNS), [*LINES.values()])
+PARTS = TableSpec("Share of sub-goals reached", columns("subgoals_reached", COLUMNS), [*LINES.values()])
+DETAILS = TableSpec(
+    "Actions, beliefs and planning time",
+    columns("", COLUMNS),
+    [
+        Line(key=key, kind=LINES[key].kind, metric=metric, label=f"{label}, {key}", digits=digits, note=note)
+        for keys, metric, label, digits, note in (
+            ((*OURS, EXPERT), "steps", "pick-and-places", 1, ""),
+            (
+                OURS,
+                "wrong_belief",
+                "wrong belief",
+                2,
+                "the planner's verdict at the end is not the simulator's",
+            ),
+            ((OURS[1], ANY_ORDER), "empties_first", "empties the bowl first", 2, ""),
+            (OURS[:1], "seconds", "seconds a plan", 2, "on one core, as busy as it was; not in results.json"),
+        )
+        for key in keys
+    ],
+)
+PLOTTED = [
+    Line(key=key, label=label, hue=hue)
+    for key, label, hue in (
+        (OURS[0], "replanning", 0), (OURS[1], "one plan", 3), (ANY_ORDER, "random order", 1),
+        (ANY_STEPS, "random steps", 2),
+    )
+]  # fmt: skip
+
+
+def seconds(found: Found) -> dict[str, dict[str, float]]:
+    """Mean planning seconds, line -> column -> seconds."""
+    return planning_seconds([o for title in PLACES for o in found[title]], column_of)
+
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    figures = list(results.rows)
+    for title, value in seconds(found).get(OURS[0], {}).items():
+        figures.append(Row(OURS[0], *COLUMNS[title], "seconds", value, value, value, 1))
+    caption = "Dots with 95 % intervals over scenes; all but the first carry out one plan."
+    plotted = {"caption": caption, "lines": PLOTTED}
+    success = plot_table("success.png", GOALS, figures, label="whole goal reached", **plotted)  # type: ignore[arg-type]
+    parts = plot_table("subgoals.png", PARTS, figures, label="share of sub-goals reached", **plotted)  # type: ignore[arg-type]
     return [
-        LongEpisode(method, scene, seed)
-        for scene in long_scenes(column, sizes.scenes(column), seed)
-        for method in METHODS
-        if method.plays(column)
+        Section(
+            "Whole goals",
+            "A goal of n steps names n blocks and a bowl for each. With one plan, n actions are made; with replanning, "
+            "up to three times as many. In the first three columns the order of the steps does not matter, because no "
+            "two of them share a bowl: the row with the goal's own steps in random order then shows what carrying out "
+            "alone achieves, and what is lost against it was lost by choosing. In the last column one of the blocks "
+            "lies in the bowl that the other is to go into, and the sentence names the moves in the order that does "
+            "not work. Ours then rests on a rule of the planner, that a bowl in which a block is seen has no room; the "
+            "row without the rule shows what the imagined frames alone achieve.",
+            [GOALS.table(figures), success],
+        ),
+        Section(
+            "Parts of goals",
+            "How much of the goal holds at the end, by the simulator; nothing of it holds at the start.",
+            [PARTS.table(figures), parts, DETAILS.table(figures)],
+        ),
+        Section(
+            "Planned beside executed",
+            "Failures first, then the longest goals that were reached. Left: the course that each action was read off, "
+            "one after another. Right: the camera.",
+            [Clips(found["clips"])] if found["clips"] else [],
+        ),
     ]
 
 
-def long_rows(outcomes: Sequence[LongOutcome]) -> list[Row]:
-    """Every figure of every method and column, as far as there are outcomes."""
-    rows = []
-    for method in METHODS:
-        for column in LONG_COLUMNS:
-            here = [
-                o for o in outcomes if o.episode.method == method and o.episode.scene.split == column.split
-            ]
-            if here:
-                rows += column_rows(method, column, here)
-    return rows
-
-
-def column_rows(method: LongMethod, column: LongColumn, here: Sequence[LongOutcome]) -> list[Row]:
-    """The figures of one method in one column."""
-    place = method.name, column.split, column.name
-    rows = [
-        rate_row(*place, "closed_loop_success", [o.success for o in here]),
-        rate_row(*place, "subgoals_reached", [o.gained for o in here]),
-        mean_row(*place, "steps", [len(o.instructions) for o in here]),
+def cards(run: Run, results: Results) -> list[CardSpec]:
+    """Ours in every column, and what carrying out alone achieves."""
+    wanted = [
+        ("Two steps, order left to chance", ANY_ORDER, "two steps", "told the steps"),
+        ("Bowl taken, order left to chance", ANY_ORDER, "bowl taken", "order matters"),
+        ("Two steps, random steps", ANY_STEPS, "two steps", "the floor"),
+        ("Bowl taken, expert as written", AS_WRITTEN, "bowl taken", "must be 0"),
     ]
-    if all(o.believes_reached is not None for o in here):
-        wrong = [o.believes_reached != o.success for o in here]
-        rows.append(rate_row(*place, "wrong_belief", wrong))
-    if column.split == TAKEN:
-        rows.append(rate_row(*place, "empties_first", [o.empties_first for o in here]))
-    return rows
+    for title in reversed(PLACES):
+        compare = f"one plan {Cell.of(results.find(OURS[1], title, SUCCESS)).text}"
+        wanted.insert(0, (f"{title.capitalize()}, replanning", OURS[0], title, compare))
+    return [CardSpec(label, LINES[k], Column("", *COLUMNS[t], SUCCESS), text) for label, k, t, text in wanted]
 
 
-def headline(rows: Sequence[Row]) -> dict[str, float]:
-    """The figures that are asked for by name: success by method and column."""
-    found = {(row.method, row.split): row.value for row in rows if row.metric == "closed_loop_success"}
-    names = {
-        "ours, replanning": "closed_loop",
-        "ours, one plan": "closed_loop_one_plan",
-        "random order, one plan": "random_order_one_plan",
-        "random sequence, one plan": "random_sequence_one_plan",
-        "expert": "expert",
-    }
-    columns = {"test": "one_step", "two_steps": "two_steps", "three_steps": "three_steps", TAKEN: TAKEN}
-    return {
-        f"{name}_{columns[split]}": round(found[method, split], 4)
-        for method, name in names.items()
-        for split in columns
-        if (method, split) in found
-    }
-
-
-def seeds_used(episodes: dict[str, list[LongEpisode]], seed: int) -> dict[str, list[int]]:
-    """Every seed, by what it was used for."""
-    seeds = {"slots": [seed]}
-    for name, units in episodes.items():
-        if units:
-            seeds[f"scenes, {name}"] = list(dict.fromkeys(unit.scene.seed for unit in units))
-    return seeds
-
-
-def planning_seconds(outcomes: Sequence[LongOutcome]) -> dict[str, dict[str, float]]:
-    """Mean planning seconds, method -> column -> seconds."""
-    table: dict[str, dict[str, float]] = {}
-    for method in METHODS:
-        for column in LONG_COLUMNS:
-            seconds = [
-                o.planning_seconds
-                for o in outcomes
-                if o.episode.method == method
-                and o.episode.scene.split == column.split
-                and o.planning_seconds is not None
-            ]
-            if seconds:
-                table.setdefault(method.name, {})[column.name] = round(float(np.mean(seconds)), 3)
-    return table
-
+STUDY = Study(
+    name="long_horizon",
+    title="Long goals",
+    question="Can a robot that imagines several steps ahead reach goals that need them, and what does it gain by "
+    "looking again after every step?",
+    args=FullArgs,
+    sizes=lambda args: QUICK if args.quick else FULL if args.full else DEFAULT,
+    horizon=HORIZON,
+    units=units,
+    cases=cases,
+    rows=rows,
+    tables=(GOALS, PARTS),
+    page=page,
+    cards=cards,
+    headline=lambda run: HEADLINE,
+    first=(
+        "closed_loop_two_steps", "closed_loop_three_steps", "closed_loop_bowl_taken",
+        "closed_loop_one_plan_three_steps",
+    ),
+    files=lambda run, found: {"timings.json": json.dumps(seconds(found), indent=2) + "\n"},
+)  # fmt: skip
 
 if __name__ == "__main__":
-    start(main, Args)
+    start(STUDY)

@@ -5,252 +5,583 @@
     python experiments/runtime.py --checkpoint runs/polish/checkpoint
 
 Milliseconds for 1, 9 and 24 imagined frames, for one scene and for 16, encode, predict and decode apart, on one
-thread and on all: the shipped model, the same in the published form (a window computed again at every step), the
-baselines that are there, and the paper's own sizes with random weights, which is good for timing and nothing else.
-Competitors take turns in every round, so ratios hold on a busy machine too; they are the figures that travel between
-machines. Writes `results.json`, `report.html` and a plot into `--out`.
+thread and on all: the shipped model, the same without its cache and in the published form (a window computed again at
+every step), the baselines that are there, and the paper's own sizes with random weights, which is good for timing and
+nothing else. Competitors take turns in every round, so ratios hold on a busy machine too; they are the figures that
+travel between machines. Writes `results.json`, `report.html` and a plot into `--out`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import cast
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
+from scipy.stats import binom
 
-from experiments.protocol.arguments import StudyArgs, start
-from experiments.protocol.contenders import BASELINES, Absent, LoadVideo, find_contenders
-from experiments.protocol.running import StudyRun
-from experiments.protocol.runtime_report import build_report, phase_table, ratio_table
-from experiments.protocol.runtime_rows import (
-    OURS,
-    PAPER_CACHE,
-    PAPER_WINDOW,
-    UNTRAINED,
-    WINDOW,
-    cell_rows,
-    headline,
-    query_rows,
-    ratio_rows,
+from experiments.report.page import Card, CardSpec, Section
+from experiments.report.plots import plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Key, Row, interval_row
+from experiments.report.tables import Column, Line, Table, TableSpec
+from experiments.study.methods import BASELINES, Missing, lines
+from experiments.study.pool import Worker, available_cores
+from experiments.study.run import Found, Part, Run, Study, UsageError, start
+from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes
+from planning import (
+    THRESHOLDS,
+    AppearanceGrounder,
+    Instruction,
+    SuccessCriterion,
+    measure_rollout,
+    watched_frames,
 )
-from experiments.protocol.runtime_subjects import (
-    Cell,
-    Phase,
-    Scenes,
-    Subject,
-    Work,
-    mage_subject,
-    paper_models,
-    planning_query,
-    published_form,
-    slot_subject,
-    untrained_mage,
-    whole_subject,
-)
-from experiments.protocol.scenes import draw, test_scenes
-from experiments.protocol.timing import machine_in_words, other_load, race
-from experiments.protocol.workers import available_cores
-from experiments.reporting import Results, StudyProgress
-from planning import AppearanceGrounder, Instruction, PinholeCamera
-from textocvp.baselines.mage import MageVideoModel
+from planning.scores import DEFAULT_SCORE
+from textocvp.baselines.mage import Mage, MageVideoModel, mage_preset
+from textocvp.config import ModelConfig
+from textocvp.metrics.intervals import Interval
+from textocvp.model import TextOCVP
+from textocvp.presets import preset
+from textocvp.protocols import VideoModel
+from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
 
-MAGE = "MAGE"
-EVERY_PHASE: tuple[Phase, ...] = ("encode", "predict", "decode", "all")
+UNTRAINED = "untrained, timing only"
+OURS, WINDOW, UNCACHED = "TextOCVP", "TextOCVP, published window", "TextOCVP, no cache"
+PAPER_WINDOW, PAPER_CACHE = "paper's sizes, published window", "paper's sizes, cache"
+LINES = [
+    Line(key=OURS, note="as it ships: frame-causal, keys and values cached"),
+    Line(key=WINDOW, kind="control", hue=1,
+         note=f"the same sizes, the last 10 frames computed again at every step; {UNTRAINED}"),
+    Line(key=UNCACHED, kind="control", hue=2, note="as it ships, the past computed again at every step"),
+    *lines(BASELINES),
+    Line(key=PAPER_WINDOW, kind="control", note=f"8 layers of 512, 8 slots of 128; {UNTRAINED}"),
+    Line(key=PAPER_CACHE, kind="control", note=f"the same; {UNTRAINED}"),
+]  # fmt: skip
+AGAINST = {WINDOW: OURS, UNCACHED: OURS, PAPER_WINDOW: PAPER_CACHE}
+"""What each is compared with in every phase. What is not here is compared with ours, all phases together."""
+CANDIDATES, STEPS, STRIDE = 30, 24, 3  # of a planning query
+QUERY = f"planning query, {CANDIDATES} candidates x {STEPS} frames"
+CORES = available_cores()
+FEWEST = 3  # rounds that are always made, however long they take
+
+Phase = Literal["encode", "predict", "decode", "all", "query", "imagine", "masks"]
+PHASES: tuple[Phase, ...] = ("encode", "predict", "decode", "all")
+PLANNING: tuple[Phase, ...] = ("query", "imagine", "masks")
+Work = Callable[[], object]
+Name = TypeVar("Name")
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        frames, batches: of the measurements.
-        repeats: rounds of each measurement. seconds: for all models together; what has used its share of them is
-            measured 3 times only.
-        drawn: at the paper's sizes, at most so many frames (of all scenes together) are drawn, as that takes half a
-            second each.
-        heavy: frames of all scenes together, at most, for what is slower than the shipped model by far.
-        threads: of PyTorch; by default one, and as many as there are cores.
-    """
-
-    frames: tuple[int, ...]
-    batches: tuple[int, ...]
-    repeats: int
-    seconds: float
+    frames: tuple[int, ...]  # numbers of imagined frames
+    batches: tuple[int, ...]  # numbers of scenes at once
+    repeats: int  # rounds of each measurement
+    seconds: float  # for all models together; what has used its share of them is measured 3 times only
+    # Frames of all scenes together, at most: that are drawn at the paper's sizes, as each takes half a second (0 leaves
+    # these sizes out), and that what is slower than the shipped model by far is asked for.
     drawn: int
     heavy: int = 1_000_000
-    threads: tuple[int, ...] = tuple(sorted({1, available_cores()}))
+    threads: tuple[int, ...] = tuple(sorted({1, CORES}))  # of PyTorch
 
 
-QUICK = Sizes(
-    frames=(1, 9),
-    batches=(1, 16),
-    repeats=7,
-    seconds=1.0,
-    drawn=1,
-    heavy=16,
-    threads=(available_cores(),),
-)
-DEFAULT = Sizes(frames=(1, 9, 24), batches=(1, 16), repeats=15, seconds=6.0, drawn=24)
+QUICK = Sizes((1, 9), (1, 16), repeats=7, seconds=1.0, drawn=1, heavy=16, threads=(CORES,))
+DEFAULT = Sizes((1, 9, 24), (1, 16), repeats=15, seconds=6.0, drawn=24)
 
 
-@dataclass
-class Args(StudyArgs):
-    """Time the models."""
+@dataclass(frozen=True)
+class Timing:
+    """What is timed."""
 
-    out: Path = Path("results/runtime")
-    """Folder for results.json, report.html and a plot."""
-    seed: int = 0
-    """Chooses the scenes that are looked at."""
-    quick: bool = False
-    """A first look with fewer repeats, at most 3 minutes on 2 cores."""
-    workers: int = 0
-    """Only here because every study has it: timing uses one process, so that nothing disturbs it."""
+    # `encode`: one observed frame; `predict`: read the sentences and imagine slots or codes; `decode`: draw them;
+    # `all`: from observed frames to imagined ones; `query`: of a planner, and in it `imagine` and draw `masks`
+    phase: Phase
+    frames: int  # how many are imagined (1 for `encode`)
+    batch: int  # scenes at once, or candidates
+    threads: int  # of PyTorch
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Split and variant of its rows."""
+        variant = QUERY if self.phase == "query" else f"{self.phase}, {self.frames} x {self.batch}"
+        return threads_word(self.threads), variant
 
 
-def main(args: Args, sizes: Sizes | None = None, paper: bool = True) -> Results:
-    """Run the study and write its folder.
+Seconds = Mapping[tuple[str, Timing], np.ndarray]
+"""(name of who was timed, what was timed) -> (rounds,) seconds."""
 
-    Args:
-        args: the command line.
-        sizes: how much is measured; by default what `args` ask for.
-        paper: whether to time the paper's sizes too, which takes most of the time.
+
+def threads_word(count: int) -> str:
+    """As `2 threads`."""
+    return f"{count} thread" + ("s" if count > 1 else "")
+
+
+def all_timings(sizes: Sizes) -> list[Timing]:
+    """Every measurement, small before large, and planning last."""
+    shapes = [("encode", 1), *product(PHASES[1:], sizes.frames)]
+    made = [Timing(p, t, b, n) for n, b, (p, t) in product(sizes.threads, sizes.batches, shapes)]
+    return made + [Timing(p, STEPS, CANDIDATES, n) for n, p in product(sizes.threads, PLANNING)]
+
+
+# --- how time is taken ------------------------------------------------------------------------------------------------
+
+
+def race(
+    works: Mapping[Name, Work], repeats: int, seconds: float, clock: Callable[[], float] = time.perf_counter
+) -> dict[Name, np.ndarray]:
+    """(rounds,) seconds of each piece of work, after one round that does not count.
+
+    In every round each has its turn, starting with another one, so that whatever else the machine does meets all of
+    them alike and the ratio of two of them in one round means something. What has used its equal share of `seconds`
+    takes no part after the third of `repeats` rounds, so that it does not cut short what is quick.
+    """
+    for work in works.values():
+        work()
+    taken: dict[Name, list[float]] = {name: [] for name in works}
+    for number in range(repeats):
+        running = [
+            name
+            for name, rounds in taken.items()
+            if len(rounds) == number and (number < FEWEST or sum(rounds) < seconds / len(works))
+        ]
+        turn = number % max(1, len(running))
+        for name in running[turn:] + running[:turn]:
+            began = clock()
+            works[name]()
+            taken[name].append(clock() - began)
+    return {name: np.array(rounds) for name, rounds in taken.items()}
+
+
+def median_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
+    """A median and its distribution-free interval: from one order statistic to another.
+
+    With fewer than 6 values no such interval reaches 95 %; it is then their range.
 
     Raises:
-        OSError: if the folder cannot be written, before any work is done.
-        CheckpointError: if there is no such checkpoint, before any work is done.
+        ValueError: if there is no value.
     """
-    run, sizes = StudyRun.open("runtime", args), sizes or (QUICK if args.quick else DEFAULT)
-    # A checkpoint's, so that it is more than what the other studies ask for.
-    world_model, busy = cast(WorldModel, run.world_model), other_load()
-    scenes = look(args.seed, max(sizes.batches))
-    subjects, absent = all_subjects(world_model, scenes, sizes.drawn if paper else 0)
-    threads = sizes.threads
-    cells = all_cells(sizes)
-    seconds: dict[tuple[str, Cell], np.ndarray] = {}
-    before = torch.get_num_threads()
-    try:
-        with StudyProgress({"phases": (len(cells), 3.0), "planning": (len(threads), 10.0)}) as progress:
-            for cell in progress.track("phases", cells):
-                torch.set_num_threads(cell.threads)
-                works = {
-                    one.name: work
-                    for one in subjects
-                    if not (one.heavy and cell.frames * cell.batch > sizes.heavy)
-                    and (work := one.work(cell)) is not None
-                }
-                timed = race(works, sizes.repeats, sizes.seconds)
-                seconds |= {(name, cell): taken for name, taken in timed.items()}
-                progress.show(phase_table(cell_rows(seconds), cell.threads, cell.batch, sizes.frames))
-            queries = {}
-            for count in progress.track("planning", threads):
-                torch.set_num_threads(count)
-                queries[count] = race(plan_works(world_model, args.seed), sizes.repeats, 2 * sizes.seconds)
-    finally:
-        torch.set_num_threads(before)
-    rows = cell_rows(seconds) + query_rows(queries) + ratio_rows(seconds, queries)
-    seeds = {
-        "study": [args.seed],
-        "scenes": [scene.seed for scene in test_scenes("test", len(scenes.texts), args.seed)],
-    }
-    results = run.results(rows, headline(rows, max(threads)), seeds, {"machine": machine_in_words()})
-    notes = {subject.name: subject.note for subject in subjects}
-    run.write(build_report(results, notes, absent, sizes.drawn, busy, run.command))
-    run.close(progress, results, [phase_table(rows, max(threads), 1, sizes.frames), ratio_table(rows)])
-    return results
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    n = len(ordered)
+    if n == 0:
+        raise ValueError("no values to take a median of")
+    # P(the median lies between the k-th smallest and the k-th largest) = 1 - 2 P(Binomial(n, 1/2) < k)
+    outside = (1 - confidence) / 2
+    k = max((k for k in range(1, n // 2 + 1) if binom.cdf(k - 1, n, 0.5) <= outside), default=1)
+    return Interval(float(np.median(ordered)), float(ordered[k - 1]), float(ordered[n - k]), n)
 
 
-def look(seed: int, count: int) -> Scenes:
-    """The first observations of `count` scenes of the test split."""
-    images, texts = [], []
-    scenes = test_scenes("test", count, seed)
-    env = scenes[0].make()
-    for scene in scenes:
-        drawn = draw(env, scene)
-        images.append(drawn.observation["rgb"])
-        texts.append(drawn.texts[0])
-    env.close()
-    return Scenes(np.stack(images), tuple(texts))
+def machine_in_words() -> str:
+    """What figures in seconds depend on, without the machine's name."""
+    told = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
+    named = [line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")]
+    processor = named[0] if named else platform.machine() or "unknown processor"
+    return (
+        f"{CORES} core{'s' if CORES != 1 else ''} ({processor}), PyTorch {torch.__version__} in float32, "
+        f"Python {platform.python_version()}, {platform.system()}"
+    )
 
 
-def all_subjects(world_model: WorldModel, scenes: Scenes, drawn: int) -> tuple[list[Subject], list[Absent]]:
-    """Everything that is timed, and the baselines that are not there.
+# --- what is timed ----------------------------------------------------------------------------------------------------
 
-    Args:
-        drawn: see `Sizes`; with 0 the paper's sizes are left out.
-    """
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A model in its phases. What comes before a phase is computed once and not timed."""
+
+    name: str  # of its rows
+    model: VideoModel
+    phases: tuple[Phase, ...] = PHASES  # that are asked for
+    drawn: int | None = None  # the most frames of all scenes together that it is asked to draw
+    heavy: bool = False  # whether it takes so long that a first look leaves out its large measurements
+    cached: bool = True  # whether keys and values are kept
+
+    def work(self, what: Timing, sampled: Sequence[SampledScene]) -> Work | None:
+        """The work of a measurement; None for what the model cannot do or is not asked."""
+        longest, count = self.model.longest_horizon, what.frames * what.batch
+        too_many = what.phase in ("decode", "all") and self.drawn is not None and count > self.drawn
+        if what.phase not in self.phases or (longest is not None and what.frames > longest) or too_many:
+            return None
+        if what.phase in PLANNING:
+            return planning_work(self.model, what.phase, sampled[0])
+        images_BHW3 = np.stack([one.observation["rgb"] for one in sampled[: what.batch]])
+        texts = [one.texts[0] for one in sampled[: what.batch]]
+        if what.phase == "all":
+            return lambda: self.model.imagine(images_BHW3, texts, horizon=what.frames)
+        cut = self._codes if isinstance(self.model, MageVideoModel) else self._slots
+        with torch.no_grad():
+            return torch.no_grad()(cut(what, images_BHW3, texts))
+
+    def _slots(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Work:
+        assert isinstance(self.model, WorldModel)
+        world_model, model = self.model, self.model.model
+        if what.phase == "encode":
+            return lambda: world_model.parse(images_BHW3[:, None])
+        seed_B1KD = world_model.parse(images_BHW3[:, None]).slots
+        if what.phase == "predict":
+            options = {"use_cache": self.cached}
+            return lambda: model.predictor.rollout(seed_B1KD, model.text(texts), what.frames, **options)
+        # Slots of the observation will do: what slots hold does not change what drawing them costs.
+        slots_BTKD = seed_B1KD.expand(-1, what.frames, -1, -1)
+        rest = tuple(texts), world_model.image_size, model.parser.layout, model.renderer
+        return lambda: Rollout(slots_BTKD, *rest).frames
+
+    def _codes(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Work:
+        assert isinstance(self.model, MageVideoModel)
+        model = self.model.model
+        frames_B3HW = torch.from_numpy(images_BHW3).permute(0, 3, 1, 2).float() / 127.5 - 1
+        if what.phase == "encode":
+            return lambda: model.vqvae.encode(frames_B3HW)
+        seen_B1hw = model.vqvae.encode(frames_B3HW)[:, None]
+        if what.phase == "predict":
+            return lambda: model.axial.imagine(seen_B1hw, model.text(texts), what.frames)
+        codes_Nhw = seen_B1hw.expand(-1, what.frames, -1, -1).flatten(0, 1)
+        return lambda: model.vqvae.decode(codes_Nhw)
+
+
+def subjects_of(run: Run) -> list[Subject]:
+    """Ours in its forms, the baselines that are there, and the paper's sizes."""
+    ours, missing, drawn = run.world_model, list(run.missing), run.sizes.drawn
+    if not isinstance(ours, WorldModel):
+        raise UsageError(f"{run.args.checkpoint} is no world model whose phases are known")
     subjects = [
-        slot_subject(
-            OURS, "as it ships: frame-causal, keys and values cached", world_model, scenes, EVERY_PHASE
+        Subject(OURS, ours, (*PHASES, *PLANNING)),
+        Subject(WINDOW, published_form(ours), ("predict", "all", "query", "imagine")),
+        Subject(UNCACHED, ours, ("predict",), cached=False),
+    ]
+    for one in run.models:
+        model = one.load()
+        if tuple(model.image_size) != tuple(ours.image_size):
+            missing.append(Missing(one.key, f"it looks at frames of {model.image_size} pixels"))
+        else:
+            phases = PHASES if isinstance(model, (WorldModel, MageVideoModel)) else ("all",)
+            subjects.append(Subject(one.key, model, phases, heavy=isinstance(model, MageVideoModel)))
+    torch.manual_seed(0)
+    if "MAGE" in {
+        absent.key for absent in missing
+    }:  # how long it takes does not depend on what it has learned
+        missing.append(Missing("MAGE (trained)", "it was timed with random weights"))
+        subjects.append(Subject("MAGE", MageVideoModel(Mage(mage_preset("mage-small"))), heavy=True))
+    run.missing = tuple(missing)
+    if drawn:
+        config = preset("savi-cater")
+        paper = TextOCVP(config)
+        causal = replace(config, predictor=replace(config.predictor, attention="causal", window=STEPS))
+        subjects.append(Subject(PAPER_WINDOW, WorldModel(paper), drawn=drawn, heavy=True))
+        subjects.append(Subject(PAPER_CACHE, reshaped(paper, causal), ("predict", "all"), drawn, heavy=True))
+    return subjects
+
+
+def published_form(world_model: WorldModel) -> WorldModel:
+    """The same sizes with the published predictor: a window of 10 frames, computed again at every step."""
+    config = world_model.model.config
+    window = replace(config.predictor, attention="window", window=10, age_encoding="learned")
+    return reshaped(world_model.model, replace(config, predictor=window))
+
+
+def reshaped(model: TextOCVP, config: ModelConfig) -> WorldModel:
+    """A model in another form of its predictor, with its weights as far as they fit: good for timing only."""
+    other = TextOCVP(config)
+    weights = {name: tensor for name, tensor in model.state_dict().items() if name != "predictor.ages"}
+    other.load_state_dict(weights, strict=False)
+    return WorldModel(other)
+
+
+def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Work:
+    """What a planner asks for once, or one of its costly parts.
+
+    Parse the picture, find the things in it, imagine 30 candidates for 24 frames, draw the masks that the scorer looks
+    at, score and judge.
+
+    Raises:
+        GroundingError: if the goal's things are not seen.
+    """
+    assert isinstance(model, WorldModel)
+    image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
+    goal, parsed = Instruction.parse(sampled.texts[0]), model.parse(image_1HW3)
+    frames = watched_frames(STEPS + 1, THRESHOLDS.settle_frames, STRIDE)
+    allowed = ground(parsed).with_kinds(goal.things).instructions(goal.relation)
+    texts = [allowed[i % len(allowed)].text for i in range(CANDIDATES)]
+
+    def query() -> object:
+        parsed = model.parse(image_1HW3)
+        grounding = ground(parsed).with_kinds(goal.things)
+        rollout = model.rollout(parsed, texts, horizon=STEPS)
+        trace = measure_rollout(rollout, grounding, goal, frames=frames)
+        return DEFAULT_SCORE(trace), SuccessCriterion()(trace)
+
+    if phase == "query":
+        return query
+    if phase == "imagine":
+        return lambda: model.rollout(parsed, texts, horizon=STEPS)
+    rollout = model.rollout(parsed, texts, horizon=STEPS)
+    # A selection of it each time: what a rollout has drawn it does not draw again.
+    return lambda: rollout.select(slice(None)).decode_masks(frames)
+
+
+# --- units of work ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Field:
+    """Everybody who is timed, what they look at, and how busy the machine was before."""
+
+    subjects: list[Subject]
+    sampled: list[SampledScene]
+    busy: float  # 0 idle, 1 all cores busy, more if work queued
+
+
+def prepare(run: Run) -> Field:
+    """Look at as many scenes as the largest batch has."""
+    busy = os.getloadavg()[0] / CORES if hasattr(os, "getloadavg") else 0.0
+    scenes = study_scenes("test", max(run.sizes.batches), run.args.seed)
+    env = scenes[0].make()
+    sampled = [sample_scene(env, scene) for scene in scenes]
+    env.close()
+    return Field(subjects_of(run), sampled, busy)
+
+
+@dataclass(frozen=True)
+class Race:
+    """A unit of work: one phase of everybody."""
+
+    what: Timing
+    field: Field
+    sizes: Sizes
+
+    @property
+    def scenes(self) -> list[StudyScene]:
+        """What is looked at."""
+        return [one.scene for one in self.field.sampled]
+
+    def run(self, worker: Worker) -> Seconds:
+        """Time it."""
+        what, sizes = self.what, self.sizes
+        torch.set_num_threads(what.threads)
+        works = {
+            (one.name, what): work
+            for one in self.field.subjects
+            if not (one.heavy and what.frames * what.batch > sizes.heavy)
+            and (work := one.work(what, self.field.sampled)) is not None
+        }
+        taken = race(works, sizes.repeats, sizes.seconds * (2 if what.phase in PLANNING else 1))
+        torch.set_num_threads(1)  # as for every unit of a study
+        return taken
+
+
+def units(run: Run) -> dict[str, Part]:
+    """Every phase, small before large."""
+    return {"phases": Part([Race(what, run.prepared, run.sizes) for what in all_timings(run.sizes)], 3.0)}
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def rows(run: Run, found: Found) -> list[Row]:
+    """Every figure; `n` counts rounds."""
+    return rows_of({key: its for outcome in found["phases"] for key, its in outcome.items()})
+
+
+def rows_of(seconds: Seconds) -> list[Row]:
+    """Milliseconds, planning queries a second, and ratios."""
+    made = []
+    for (name, what), taken in seconds.items():
+        figures = {"milliseconds": 1000 * taken}
+        if what.phase == "query":
+            figures = {"queries_per_second": 1 / taken, "candidates_per_second": CANDIDATES / taken}
+        made += [interval_row(name, *what.place, m, median_interval(values)) for m, values in figures.items()]
+    for (name, what), taken in seconds.items():
+        against = AGAINST.get(name, OURS if what.phase == "all" and name != OURS else "")
+        if (other := seconds.get((against, what))) is not None:
+            both = min(len(taken), len(other))  # the rounds in which both took part
+            ratio = median_interval(taken[:both] / other[:both])
+            made.append(interval_row(f"{name} / {against}", *what.place, "ratio", ratio))
+        for label, above, below, factor in own_ratios(what):
+            if (name, above) in seconds and (name, below) in seconds:
+                a, b = (median_interval(seconds[name, one]) for one in (above, below))
+                value, low, high = (
+                    a.value / b.value / factor,
+                    a.low / b.high / factor,
+                    a.high / b.low / factor,
+                )
+                ratio = Interval(value, low, high, min(a.n, b.n))
+                made.append(interval_row(f"{name}: {label}", *what.place, "ratio", ratio))
+    return made
+
+
+OWN = DECODE, BATCH, THREADS = "decode / predict", "a scene of a batch / a scene alone", "1 thread / all"
+
+
+def own_ratios(what: Timing) -> Iterator[tuple[str, Timing, Timing, int]]:
+    """A subject against itself: (label, above, below, factor)."""
+    # Measured at different moments, so the rounds are not paired: the medians are divided, and the interval is that of
+    # the worst case.
+    if what.phase == "predict":
+        yield DECODE, replace(what, phase="decode"), what, 1
+    if what.batch > 1:
+        yield BATCH, what, replace(what, batch=1), what.batch
+    if what.threads > 1:
+        yield THREADS, replace(what, threads=1), what, 1
+
+
+_WINDOW, _PAPER, _MAGE = f"{WINDOW} / {OURS}", f"{PAPER_WINDOW} / {PAPER_CACHE}", f"MAGE / {OURS}"
+# Name, method, variant, metric; of those that have a card its label, and what to read it against.
+FIGURES = (
+    ("window_over_cache_9_frames", _WINDOW, "predict, 9 x 1", "ratio",
+     "Window over cache, 9 frames", "our prototype: 2.4 x"),
+    ("window_over_cache_9_frames_batch_16", _WINDOW, "predict, 9 x 16", "ratio",
+     "The same, 16 scenes", "our prototype: 4.0 x"),
+    ("window_over_cache_24_frames", _WINDOW, "predict, 24 x 1", "ratio", "", ""),
+    ("window_over_cache_planning", _WINDOW, QUERY, "ratio", "", ""),
+    ("paper_window_over_cache_9_frames", _PAPER, "predict, 9 x 1", "ratio",
+     "Window over cache, paper's sizes", "untrained"),
+    ("paper_window_over_cache_9_frames_batch_16", _PAPER, "predict, 9 x 16", "ratio", "", ""),
+    ("decode_over_predict_9_frames", f"{OURS}: {DECODE}", "predict, 9 x 1", "ratio",
+     "Decode over predict, 9 frames", "paper's code: 10 x"),
+    ("mage_over_textocvp_9_frames", _MAGE, "all, 9 x 1", "ratio", "MAGE over TextOCVP, 9 frames", "all phases"),
+    ("mage_over_textocvp_9_frames_batch_16", _MAGE, "all, 9 x 16", "ratio", "", ""),
+    ("batch_16_per_scene", f"{OURS}: {BATCH}", "all, 9 x 16", "ratio", "", ""),
+    ("one_thread_over_all", f"{OURS}: {THREADS}", "all, 9 x 16", "ratio", "", ""),
+    ("planning_queries_per_second", OURS, QUERY, "queries_per_second", "Planning queries a second", "bar: 1"),
+    ("milliseconds_9_frames", OURS, "all, 9 x 1", "milliseconds", "9 frames, one scene", "all phases"),
+)  # fmt: skip
+
+
+def headline(run: Run) -> dict[str, Key]:
+    """The figures that are asked for by name, on all threads."""
+    split = threads_word(max(run.sizes.threads))
+    return {name: (method, split, variant, metric) for name, method, variant, metric, *_ in FIGURES}
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+_PAIRS = [*AGAINST.items(), *((key, OURS) for key in (*BASELINES, PAPER_CACHE))]
+RATIOS = [
+    Line(key=f"{name} / {other}", kind="ours" if name == WINDOW else "control") for name, other in _PAIRS
+]
+RATIOS += [Line(key=f"{line.key}: {label}", kind="control") for label in OWN for line in LINES]
+
+
+def phase_spec(metric: str, threads: int, batch: int, frames: Sequence[int] = DEFAULT.frames) -> TableSpec:
+    """Milliseconds or ratios of every phase for one number of threads and one batch."""
+    made = [t for t in all_timings(Sizes(tuple(frames), (batch,), 1, 1.0, 0, threads=(threads,)))]
+    made = [
+        t
+        for t in made
+        if t.phase in PHASES or (batch == 1 and (metric, t.phase) != ("milliseconds", "query"))
+    ]
+    titles = [f"{t.phase} {t.frames}" if t.phase in PHASES[1:] else t.phase for t in made]
+    return TableSpec(
+        f"{'Ratios' if metric == 'ratio' else 'Milliseconds'}, {threads_word(threads)}, batch {batch}",
+        [Column(title, *t.place, metric, None) for title, t in zip(titles, made, strict=True)],
+        RATIOS if metric == "ratio" else LINES,
+    )
+
+
+def planning_spec(threads: int) -> TableSpec:
+    """Planning queries and candidates a second."""
+    place = Timing("query", STEPS, CANDIDATES, threads).place
+    words = {"queries a second": "queries_per_second", "candidates a second": "candidates_per_second"}
+    made = [Column(title, *place, metric, None) for title, metric in words.items()]
+    return TableSpec(f"Planning, {threads_word(threads)}", made, LINES[:2], f"{QUERY.capitalize()}.")
+
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    figures, sizes, busy = list(results.rows), run.sizes, run.prepared.busy
+    machine = f"Measured on {results.versions['machine']}."
+    if busy > 0.5:
+        machine += (
+            f" The machine was busy with other work when the study began (load {busy:.1f} a core): milliseconds and "
+            "queries a second are too slow by about that; ratios are taken within a round and hold."
+        )
+
+    def tables(metric: str) -> list[Table]:
+        """Without the lines in which nothing was measured."""
+        made = []
+        for threads, batch in product(reversed(sizes.threads), sizes.batches):
+            spec = phase_spec(metric, threads, batch, sizes.frames)
+            measured = [line for line in spec.lines if any(spec.points(figures, line))]
+            made.append(replace(spec, lines=measured).table(figures))
+        return made
+
+    count, most = 9 if 9 in sizes.frames else sizes.frames[-1], max(sizes.threads)
+    drawn = phase_spec("milliseconds", most, 1, (count,))
+    # The paper's sizes take many times longer: on one axis with them nothing else could be told apart.
+    small = [line for line in LINES if line.key not in (PAPER_WINDOW, PAPER_CACHE)]
+    caption = f"{count} frames of one scene, {threads_word(most)}; the paper's sizes are in the tables."
+    shown = replace(drawn, columns=drawn.columns[: len(PHASES)], lines=small)
+    plot = plot_table("phases.png", shown, figures, label="milliseconds", limits=None, caption=caption)
+    return [
+        Section(
+            "Where the time goes",
+            f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). "
+            "Encode: one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours "
+            "and masks. All: from observed frames to imagined ones. A dash: there is no such phase; or, at the "
+            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of what is "
+            "slow. " + " ".join(run.remarks),
+            [*tables("milliseconds"), plot],
         ),
-        slot_subject(
-            WINDOW,
-            f"the same sizes, the last 10 frames computed again at every step; {UNTRAINED}",
-            published_form(world_model),
-            scenes,
-            ("predict", "all"),
+        Section(
+            "Figures that travel between machines",
+            "How many times longer. Milliseconds depend on the machine, ratios much less. Where two models are "
+            "compared, the ratio is taken in each round, in which both had their turn, and the median counts. Untrained "
+            "models are good for timing only.",
+            tables("ratio"),
+        ),
+        Section(
+            "Thinking before acting",
+            "One query parses the picture, finds the things in it, imagines every candidate, draws the masks that the "
+            "scorer looks at, scores and judges. A planner needs masks at few frames, and colours at none.",
+            [planning_spec(threads).table(figures) for threads in reversed(sizes.threads)],
         ),
     ]
-    loads = {baseline.method: LoadVideo(baseline.checkpoint) for baseline in BASELINES}
-    found, absent = find_contenders(loads)
-    notes = {baseline.method: baseline.note for baseline in BASELINES}
-    for contender in found:
-        name, model = contender.method, contender.load()
-        if tuple(model.image_size) != tuple(world_model.image_size):
-            absent.append(Absent(name, f"it looks at frames of {model.image_size} pixels"))
-        elif isinstance(model, WorldModel):
-            subjects.append(slot_subject(name, notes[name], model, scenes, EVERY_PHASE))
-        elif isinstance(model, MageVideoModel):
-            subjects.append(mage_subject(name, notes[name], model, scenes))
-        else:
-            subjects.append(whole_subject(name, notes[name], model, scenes))
-    if MAGE in {one.method for one in absent}:
-        # How long it takes does not depend on what it has learned.
-        note = f"{notes[MAGE]}, preset mage-small; {UNTRAINED}"
-        subjects.append(mage_subject(MAGE, note, untrained_mage(), scenes))
-        absent = [one for one in absent if one.method != MAGE]
-    if drawn:
-        window, cache = paper_models()
-        note = f"8 layers of 512, 8 slots of 128; {UNTRAINED}"
-        subjects.append(slot_subject(PAPER_WINDOW, note, window, scenes, EVERY_PHASE, drawn))
-        subjects.append(
-            slot_subject(PAPER_CACHE, f"the same; {UNTRAINED}", cache, scenes, ("predict", "all"), drawn)
-        )
-    return subjects, absent
 
 
-def all_cells(sizes: Sizes) -> list[Cell]:
-    """Every measurement, small before large."""
-    cells = []
-    for count, batch in product(sizes.threads, sizes.batches):
-        cells.append(Cell("encode", 1, batch, count))
-        cells += [
-            Cell(phase, frames, batch, count) for phase, frames in product(EVERY_PHASE[1:], sizes.frames)
-        ]
-    return cells
+def cards(run: Run, results: Results) -> list[Card]:
+    """What the cache saves, what drawing costs, and how fast a robot thinks."""
+    made, units = [], {"ratio": " x", "milliseconds": " ms"}
+    for _, method, variant, metric, label, compare in FIGURES:
+        column = Column("", threads_word(max(run.sizes.threads)), variant, metric, None)
+        card = CardSpec(label, Line(key=method), column, compare, bar=False, each="repeats").fill(results)
+        if label:
+            made.append(replace(card, value=card.value + (units.get(metric, "") if card.detail else "")))
+    return made
 
 
-def plan_works(world_model: WorldModel, seed: int) -> dict[str, Work]:
-    """A planning query with the cache, and with the published window."""
-    (scene,) = test_scenes("test", 1, seed)
-    env = scene.make()
-    drawn = draw(env, scene)
-    env.close()
-    ground = AppearanceGrounder(PinholeCamera.from_info(drawn.info["camera"]))
-    pair = Instruction.parse(drawn.texts[0])
-    image = drawn.observation["rgb"]
-    grounding = ground(world_model.parse(image[None])).told([pair.block_thing, pair.bowl_thing])
-    texts = tuple(instruction.text for instruction in grounding.instructions)
-    return {
-        name: planning_query(
-            model, image, lambda parsed: ground(parsed).told([pair.block_thing, pair.bowl_thing]), pair, texts
-        )
-        for name, model in ((OURS, world_model), (WINDOW, published_form(world_model)))
-    }
-
+STUDY = Study(
+    name="runtime",
+    title="Runtime",
+    question="How long does a thought take, and which part of it?",
+    sizes=lambda args: QUICK if args.quick else DEFAULT,
+    methods=BASELINES,
+    prepare=prepare,
+    one_process=True,  # so that nothing disturbs it
+    units=units,
+    rows=rows,
+    tables=[
+        phase_spec("milliseconds", CORES, 1), phase_spec("ratio", CORES, 1), phase_spec("ratio", CORES, 16),
+        planning_spec(CORES),
+    ],
+    page=page,
+    cards=cards,
+    headline=headline,
+    first=(
+        "window_over_cache_9_frames", "paper_window_over_cache_9_frames", "mage_over_textocvp_9_frames",
+        "planning_queries_per_second",
+    ),
+    versions=lambda run: {"machine": machine_in_words()},
+    again="The seed fixes what is looked at. Milliseconds differ from run to run and from machine to machine; ratios "
+    "should come out alike.",
+)  # fmt: skip
 
 if __name__ == "__main__":
-    start(main, Args)
+    start(STUDY)

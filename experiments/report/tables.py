@@ -29,8 +29,8 @@ class Cell:
     n: int | None = None  # how many scenes it is from; None where nothing was measured
 
     @classmethod
-    def of(cls, row: Row | None, digits: int = 2, percent: bool = False) -> Cell:
-        """The cell of a row; a dash while there is none yet."""
+    def of(cls, row: Row | None, digits: int | None = 2, percent: bool = False) -> Cell:
+        """The cell of a row, with three digits in all without `digits`; a dash while there is none yet."""
         if row is None:
             return cls(DASH)
         if percent:
@@ -38,8 +38,11 @@ class Cell:
             value, interval = as_percent(row.value), f"{low} to {high} %"
         else:
             between = " to " if row.low < 0 else DASH  # a dash beside a minus sign cannot be read
-            value = f"{row.value:.{digits}f}"
-            interval = f"{row.low:.{digits}f}{between}{row.high:.{digits}f}"
+            value, first, last = (
+                f"{end:.{2 - (end >= 10) - (end >= 100) if digits is None else digits}f}"
+                for end in (row.value, row.low, row.high)
+            )
+            interval = f"{first}{between}{last}"
         # A single scene has no interval.
         return cls(value, "" if row.n < 2 else interval, row.n)
 
@@ -216,7 +219,7 @@ class Column:
     split: str  # see `Row`
     variant: str  # see `Row`
     metric: str  # see `Row`
-    digits: int = 2  # after the point
+    digits: int | None = 2  # after the point; None for three in all
     percent: bool = False  # shown as `6.4 %`
     paper: str = ""  # metric of the paper's figures, where that is another
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -78,16 +79,18 @@ class EpisodeClip:
         episode = self.outcome.episode
         sampled = sample_scene(worker.environment(episode.scene), episode.scene, episode.variants)
         result = episode.pursue(worker, sampled)
-        imagined = [to_uint8(attempt.plan.rollout.frames[0]) for attempt in result.attempts]
-        steps = f"{result.steps} pick-and-place{'s' if result.steps != 1 else ''}"
-        error = f"; {result.error}" if result.error else ""
+        imagined = [to_uint8(attempt.rollout.frames[0]) for attempt in result.attempts]
+        done = "; ".join(text.removeprefix("put ") for text in self.outcome.instructions) or "nothing"
+        long = episode.scene.steps > 1  # only every other frame of them
+        films = [np.concatenate(imagined or [result.frames[:1]]), result.frames]
         return Clip(
             name=f"closed-loop-{self.rank}.gif",
-            gif=gif([[np.concatenate(imagined or [result.frames[:1]]), result.frames]]),
+            gif=gif([[film[:: 1 + long] for film in films]], seconds_a_frame=0.2 if long else 0.14),
             panels=("the plan, imagined", "what happened"),
             title=self.outcome.text,
-            caption=f"{self.column}, seed {episode.scene.seed}; {steps}{error}",
-            badge="success" if result.success else "failure",
+            caption=f"{self.column}, seed {episode.scene.seed}; done: {done}"
+            + (f"; {result.error}" if result.error else ""),
+            badge="success" if result.success else f"{result.gained:.0%} of the goal" if long else "failure",
             tone=tone(result.success),
         )
 
@@ -98,17 +101,30 @@ def tone(good: bool | None) -> Tone:
 
 
 def episode_clips(
-    outcomes: Sequence[LoopOutcome], column_of: Callable[[LoopEpisode], str], count: int
+    outcomes: Sequence[LoopOutcome],
+    column_of: Callable[[LoopEpisode], str],
+    count: int,
+    methods: Sequence[str] = ("ours",),
 ) -> list[EpisodeClip]:
-    """Up to `count` failures of ours, and successes with the longest goals: `2 * count` in all.
+    """Up to `count` failures, of each column in turn, and then successes: `2 * count` in all. Longest goals come first.
 
-    `column_of` gives the title of the column that an episode stands in.
+    Args:
+        outcomes: of all methods.
+        column_of: title of the column that an episode stands in.
+        count: of failures.
+        methods: whose episodes are shown.
     """
-    ours = [o for o in outcomes if o.episode.method == "ours"]
-    failures = [o for o in ours if not o.success][:count]
-    successes = sorted((o for o in ours if o.success), key=lambda o: -o.episode.scene.steps)
-    chosen = successes[: 2 * count - len(failures)] if len(failures) < count else successes[:count]
-    return [EpisodeClip(o, column_of(o.episode), rank) for rank, o in enumerate(chosen + failures, start=1)]
+    ours = [(column_of(o.episode), o) for o in outcomes if o.episode.method in methods]
+    ours.sort(key=lambda one: -one[1].episode.scene.steps)
+    failed = [(column, o) for column, o in ours if not o.success]
+    before = Counter[str]()
+    turns = []
+    for column, _ in failed:
+        turns.append(before[column])
+        before[column] += 1
+    chosen = [failed[i] for i in np.argsort(turns, kind="stable")][:count]
+    chosen += [one for one in ours if one[1].success][: 2 * count - len(chosen)]
+    return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]
 
 
 def extreme_clips(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.study.methods import METHODS
+from experiments.study.methods import METHODS, Method
 from experiments.study.pool import LoadModel, Worker
 from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene
 from planning import AppearanceGrounder, EpisodeResult, Goal, SegmentationGrounder, run_episode
@@ -19,13 +20,19 @@ class LoopOutcome:
     episode: LoopEpisode  # which one
     text: str  # the goal
     success: bool  # the simulator's verdict
+    gained: float  # by how much the share of the goal that holds rose, by the simulator
     believes_reached: bool | None  # the planner's own verdict; None for the expert
-    steps: int  # pick-and-places carried out
+    instructions: tuple[str, ...]  # what was carried out, in order
     # whether the candidate that scored best is the one that the goal names; None for goals of several steps
     # and for methods that do not rank
-    ranked_first: bool | None
-    planning_seconds: float | None  # mean time of a plan; None without one
-    error: str | None  # why the loop gave up, or None
+    ranked_first: bool | None = None
+    planning_seconds: float | None = None  # mean time of a plan; None without one
+    error: str | None = None  # why the loop gave up, or None
+
+    @property
+    def steps(self) -> int:
+        """Pick-and-places carried out."""
+        return len(self.instructions)
 
 
 @dataclass(frozen=True)
@@ -39,18 +46,28 @@ class LoopEpisode:
     seed: int = 0  # of the slots and of chance
     load: LoadModel | None = None  # makes the world model that is planned with; by default the study's own
 
+    @property
+    def acts(self) -> Method:
+        """Who acts."""
+        return METHODS[self.method]
+
+    def order(self, goal: Goal) -> tuple[str, ...]:
+        """What the expert does, in order."""
+        return tuple(instruction.text for instruction in goal.instructions)
+
     def run(self, worker: Worker) -> LoopOutcome:
         """Play the episode."""
         env = worker.environment(self.scene)
         sampled = sample_scene(env, self.scene, self.variants)
         text = sampled.texts[self.variant]
-        if METHODS[self.method].expert:
-            played = play_expert(env, sampled, self.variant)
-            return LoopOutcome(self, text, played.success, None, played.steps, None, None, None)
-        result = self.pursue(worker, sampled)
         goal = Goal.parse(text)
+        if self.acts.expert:
+            order = self.order(goal)
+            played = play_expert(env, sampled, self.variant, order)
+            return LoopOutcome(self, text, played.success, played.gained, None, order)
+        result = self.pursue(worker, sampled)
         ranked_first = None
-        if METHODS[self.method].kind != "control" and len(goal.instructions) == 1:
+        if self.acts.kind != "control" and len(goal.instructions) == 1:
             ranked_first = (
                 bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.instructions
             )
@@ -58,8 +75,9 @@ class LoopEpisode:
             episode=self,
             text=text,
             success=result.success,
+            gained=round(result.gained, 6),
             believes_reached=result.believes_reached,
-            steps=result.steps,
+            instructions=tuple(attempt.instruction.text for attempt in result.attempts),
             ranked_first=ranked_first,
             planning_seconds=result.planning_seconds if result.attempts else None,
             error=result.error,
@@ -67,10 +85,10 @@ class LoopEpisode:
 
     def pursue(self, worker: Worker, sampled: SampledScene) -> EpisodeResult:
         """Plan and act until the goal is believed to be reached, or the attempts are used up."""
-        goal, method = Goal.parse(sampled.texts[self.variant]), METHODS[self.method]
+        goal, method = Goal.parse(sampled.texts[self.variant]), self.acts
         world_model = worker.world_model if self.load is None else worker.model(self.load)
         # Seeded by scene and variant too: one stream for all episodes would depend on their order.
-        rng = np.random.default_rng([self.seed, self.scene.seed, self.variant])
+        rng = np.random.default_rng([self.seed, self.scene.seed, self.variant or method.chance])
         assert method.plan is not None
         return run_episode(
             worker.environment(self.scene),
@@ -79,4 +97,20 @@ class LoopEpisode:
             seed=self.scene.seed,
             options=sampled.options(self.variant),
             ground=(SegmentationGrounder if method.privileged else AppearanceGrounder).from_info,
+            replan=method.replan,
         )
+
+
+def planning_seconds(
+    outcomes: Sequence[LoopOutcome], column_of: Callable[[LoopEpisode], str]
+) -> dict[str, dict[str, float]]:
+    """Mean seconds of a plan, method -> column -> seconds. Not for results.json, which must come out the same again."""
+    seconds: dict[str, dict[str, list[float]]] = {}
+    for o in outcomes:
+        if o.planning_seconds is not None:
+            its = seconds.setdefault(o.episode.method, {})
+            its.setdefault(column_of(o.episode), []).append(o.planning_seconds)
+    return {
+        method: {title: round(float(np.mean(its)), 3) for title, its in table.items()}
+        for method, table in seconds.items()
+    }

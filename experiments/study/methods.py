@@ -31,6 +31,8 @@ class Method(Line):
     train: str = ""  # what to type to train it
     # makes the planner with which it acts in the closed loop; None for one that does not
     plan: MakePlanner | None = None
+    replan: bool = True  # whether it looks again after every action, and plans anew
+    chance: int = 0  # methods of other numbers draw other random numbers
     privileged: bool = False  # whether its planner is told by the simulator's segmentation which slot is what
     expert: bool = False  # whether it is the scripted expert
 

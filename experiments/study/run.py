@@ -192,7 +192,6 @@ class Run:
         world_model: a world model to look at; units get their own.
         models: of the methods, as far as they are there.
         missing: methods that cannot be measured, and why.
-        prepared: what `Study.prepare` made.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -231,7 +230,11 @@ class Run:
             loads = {key: LoadCheckpoint(name) for key, name in named.items()}
         self.models, self.missing = find_models(loads)
         self._measures = measures
-        self.prepared = study.prepare(self)
+
+    @cached_property
+    def prepared(self) -> Any:
+        """What `Study.prepare` made."""
+        return self.study.prepare(self)
 
     @cached_property
     def measures(self) -> Measures:
@@ -306,6 +309,7 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
         OSError, CheckpointError, UsageError: see `Run`; before any work is done.
     """
     this = Run(study, args or study.args(), **doubles)
+    _ = this.prepared  # may find that the model does not do
     pool, planned = Pool(this.load, this.processes), study.units(this)
     found: dict[str, list[Any]] = {part: [] for part in planned}
     seeds: dict[str, list[int]] = {"slots": [this.args.seed]}
@@ -363,14 +367,21 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
 
 
 def start(study: Study) -> None:
-    """Run a study from the command line. What the user can put right is said in one line, without a traceback."""
+    """Run a study from the command line."""
     module = inspect.getmodule(study.units)
-    try:
+    with exit_in_a_line("interrupted; what is finished is kept: start it again to go on"):
         run(study, tyro.cli(study.args, description=module.__doc__ if module else None))
+
+
+@contextmanager
+def exit_in_a_line(interrupted: str) -> Iterator[None]:
+    """What the user can put right is said in one line, without a traceback."""
+    try:
+        yield
     except (OSError, UsageError, CheckpointError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        sys.exit("interrupted; what is finished is kept: start it again to go on")
+        sys.exit(interrupted)
 
 
 def _write(this: Run, results: Results, found: Found) -> None:
@@ -394,11 +405,10 @@ def _write(this: Run, results: Results, found: Found) -> None:
 
 
 def _note_seeds(seeds: dict[str, list[int]], part: str, units: Sequence[Unit[Any]]) -> None:
-    """Every scene's seed, by what it was used for, and the slot seeds of units that have several."""
+    """The seeds of every unit's `scene` or `scenes`, by what it was used for, and its `slot_seeds`."""
     for unit in units:
         seeds["slots"] += [seed for seed in getattr(unit, "slot_seeds", ()) if seed not in seeds["slots"]]
-        scene = getattr(unit, "scene", None)
-        if scene is not None:
+        for scene in getattr(unit, "scenes", None) or filter(None, [getattr(unit, "scene", None)]):
             known = seeds.setdefault(f"{part}, {scene.split}", [])
             if scene.seed not in known:
                 known.append(scene.seed)

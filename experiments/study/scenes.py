@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -132,18 +132,27 @@ class ExpertEpisode:
     frames: np.ndarray  # (T, H, W, 3) uint8, from the first observation on
     segmentations: np.ndarray  # (T, H, W): 0 background, 1 arm, 2 + i object i
     success: bool  # the simulator's verdict
-    steps: int  # pick-and-places
+    gained: float  # by how much the share of the goal that holds rose
 
 
-def play_expert(env: gym.Env[Any, Any], sampled: SampledScene, variant: int = 0) -> ExpertEpisode:
-    """Let the scripted expert carry out one of the scene's texts."""
+def play_expert(
+    env: gym.Env[Any, Any], sampled: SampledScene, variant: int = 0, order: Sequence[str | None] = (None,)
+) -> ExpertEpisode:
+    """Let the scripted expert carry out one of the scene's texts.
+
+    Args:
+        env: of the scene.
+        sampled: the scene.
+        variant: which text the simulator judges.
+        order: what is done; by default what the text says.
+    """
     _, info = env.reset(seed=sampled.scene.seed, options=sampled.options(variant))
-    frames, segmentations, steps = [info["frames"]], [info["frame_segmentations"]], 0
-    for action in Expert(env).actions():
-        info = env.step(action)[-1]
-        frames.append(info["frames"])
-        segmentations.append(info["frame_segmentations"])
-        steps += 1
-    return ExpertEpisode(
-        np.concatenate(frames), np.concatenate(segmentations), bool(info["is_success"]), steps
-    )
+    frames, segmentations, gained = [info["frames"]], [info["frame_segmentations"]], 0.0
+    for text in order:
+        for action in Expert(env).actions(text):
+            _, reward, _, _, info = env.step(action)
+            frames.append(info["frames"])
+            segmentations.append(info["frame_segmentations"])
+            gained += float(reward)
+    success = bool(info["is_success"])
+    return ExpertEpisode(np.concatenate(frames), np.concatenate(segmentations), success, round(gained, 6))

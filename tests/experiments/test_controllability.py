@@ -108,7 +108,7 @@ def test_failures_are_shown() -> None:
     ours = replace(won, episode=LoopEpisode("ours", scene))
     lost = replace(ours, success=False)
     shown = episode_clips([ours, lost, won, ours], column_of, 1)
-    assert [clip.outcome.success for clip in shown] == [True, False]
+    assert [clip.outcome.success for clip in shown] == [False, True]
     assert {clip.column for clip in shown} == {"original"}
 
 

@@ -5,7 +5,16 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments import ablations, controllability, interpretability, long_horizon, objects, prediction, robustness, runtime
+from experiments import (
+    ablations,
+    controllability,
+    interpretability,
+    long_horizon,
+    objects,
+    prediction,
+    robustness,
+    runtime,
+)
 from experiments.report.plots import plot_table
 from experiments.report.rows import Row
 from experiments.report.tables import DASH, Cell, Column, Line, Paper, Table, TableRow, TableSpec, columns
@@ -113,7 +122,16 @@ def every_row(spec: TableSpec) -> list[Row]:
     ]
 
 
-STUDIES = (ablations, controllability, interpretability, long_horizon, objects, prediction, robustness, runtime)
+STUDIES = (
+    ablations,
+    controllability,
+    interpretability,
+    long_horizon,
+    objects,
+    prediction,
+    robustness,
+    runtime,
+)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from planning import Goal
 from experiments.controllability import LOOP_PLACES
 from experiments.study.scenes import play_expert, sample_scene, study_scenes
+from planning import Goal
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_a_variant_is_the_same_scene_with_another_goal(env, scene) -> None:
 
 def test_the_expert_plays_a_variant(env, scene) -> None:
     played = play_expert(env, sample_scene(env, scene, variants=1), 1)
-    assert played.success and played.steps == 1
+    assert played.success and played.gained == 1.0
     assert played.frames.shape[1:] == (64, 64, 3) and 15 < len(played.frames) < 40
     assert played.segmentations.shape == played.frames.shape[:3]
 
