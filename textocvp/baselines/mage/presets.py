@@ -1,7 +1,6 @@
-"""The named sizes of MAGE.
+"""The named sizes of MAGE, from "Make It Move" (CVPR 2022), section 4 and its published configuration.
 
-Those of the published model are from "Make It Move" (CVPR 2022), section 4 and the configuration published with it,
-and from TextOCVP (TMLR 2026), appendix.
+Those of MAGE-DINO are from TextOCVP (TMLR 2026), appendix.
 """
 
 from __future__ import annotations
