@@ -29,7 +29,7 @@ def ssim(imagined: Tensor, real: Tensor) -> Tensor:
     check_frames(imagined, real)
     flat = [frames.float().reshape(-1, *frames.shape[-3:]) for frames in (imagined, real)]
     value = structural_similarity_index_measure(
-        *flat, gaussian_kernel=True, sigma=1.5, kernel_size=11, reduction="none", data_range=1.0
+        flat[0], flat[1], gaussian_kernel=True, sigma=1.5, kernel_size=11, reduction="none", data_range=1.0
     )
     assert isinstance(value, Tensor)
     return value.reshape(imagined.shape[:-3])
