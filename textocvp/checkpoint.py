@@ -1,8 +1,7 @@
 """Checkpoints: a folder with `config.json` and `model.safetensors` (every tensor of the model, and no other).
 
-Frozen pretrained encoders, of text and of images, are not in it: `config.json` has their names and fingerprints. Of a
-fine-tuned one the folder `text` holds architecture and tokenizer. Loading is strict: what does not fit is an error that
-names the field or the tensor. Nothing is ever unpickled.
+Frozen pretrained encoders are not in it: `config.json` has their names and fingerprints. Of a fine-tuned text encoder
+the folder `text` holds architecture and tokenizer. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -36,15 +35,10 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where a model came from.
+    """Where a model came from."""
 
-    Attributes:
-        name: the bundled name, the folder or the hub id that was asked for.
-        sha256: of its `model.safetensors`; empty for a model that was never saved.
-    """
-
-    name: str
-    sha256: str = ""
+    name: str  # the bundled name, the folder or the hub id that was asked for
+    sha256: str = ""  # of its `model.safetensors`; empty for a model that was never saved
 
     @classmethod
     def of(cls, folder: Path, name: str) -> Checkpoint:
@@ -54,10 +48,8 @@ class Checkpoint:
 
 def bundled_checkpoints() -> list[str]:
     """Names of the checkpoints that come with the package."""
-    root = files("textocvp") / "checkpoints"
-    if not root.is_dir():
-        return []
-    return sorted(folder.name for folder in root.iterdir() if (folder / CONFIG_FILE).is_file())
+    folders = (files("textocvp") / "checkpoints").iterdir()
+    return sorted(folder.name for folder in folders if (folder / CONFIG_FILE).is_file())
 
 
 @contextmanager
@@ -122,20 +114,16 @@ def read_config(folder: Path) -> ModelConfig:
     """The configuration of the checkpoint in `folder`.
 
     Raises:
-        CheckpointError: if there is no readable `config.json` there, it is of another architecture, or a field is
-            unknown, missing or has a value that is not allowed.
+        CheckpointError: as `read_json`, or if it is of another architecture, or a field is unknown, missing or has a
+            value that is not allowed.
     """
     data = read_json(folder)
     if data.get("architecture") == "mage-vqvae":
-        raise CheckpointError(
-            f"{folder} holds a VQ-VAE, which imagines nothing: `textocvp train mage --vqvae {folder}` makes a MAGE "
-            "of it"
-        )
+        way = f"`textocvp train mage --vqvae {folder}` makes a MAGE of it"
+        raise CheckpointError(f"{folder} holds a VQ-VAE, which imagines nothing: {way}")
     if "architecture" in data:
-        raise CheckpointError(
-            f"{folder} holds a {data['architecture']!r} model, which has no slots: load it with "
-            "textocvp.protocols.load_model"
-        )
+        way = "load it with textocvp.protocols.load_model"
+        raise CheckpointError(f"{folder} holds a {data['architecture']!r} model, which has no slots: {way}")
     try:
         return ModelConfig.from_dict(data)
     except ValueError as error:
@@ -156,17 +144,14 @@ def load_weights(model: nn.Module, path: Path) -> None:
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
     wanted = model.state_dict()
-    for problem, names in (
-        ("lacks", wanted.keys() - found.keys()),
-        ("has what the model does not:", found.keys() - wanted.keys()),
-    ):
-        if names:
-            raise CheckpointError(f"{path} {problem} {_listed(sorted(names))}")
+    if lacking := wanted.keys() - found.keys():
+        raise CheckpointError(f"{path} lacks {_listed(sorted(lacking))}")
+    if other := found.keys() - wanted.keys():
+        raise CheckpointError(f"{path} has what the model does not: {_listed(sorted(other))}")
     for name, tensor in wanted.items():
         if _kind(found[name]) != _kind(tensor):
-            raise CheckpointError(
-                f"{path}: tensor {name!r} is {_described(found[name])}, the model's is {_described(tensor)}"
-            )
+            has, needs = _described(found[name]), _described(tensor)
+            raise CheckpointError(f"{path}: tensor {name!r} is {has}, the model's is {needs}")
     model.load_state_dict(found, strict=True)
 
 
@@ -174,9 +159,7 @@ def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) 
     """Write `config.json` and `model.safetensors` into `folder`, which is made if it is not there."""
     folder.mkdir(parents=True, exist_ok=True)
     # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
-    tensors = {
-        name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()
-    }
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
     save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
     (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
 

@@ -84,9 +84,9 @@ class ModelsCommand:
 
 @dataclass
 class InfoCommand:
-    """Say what a checkpoint is: its parts, their sizes and every setting. Without a name: as `textocvp models`."""
+    """Say what a checkpoint is: its parts, their sizes and every setting."""
 
-    checkpoint: tyro.conf.Positional[str | None] = None
+    checkpoint: tyro.conf.Positional[str]
     """A bundled name, a folder, or a Hugging Face hub id owner/name."""
 
 
@@ -205,12 +205,8 @@ def _rollout(command: RolloutCommand) -> None:
             f"{W}x{H}: take the picture at that size, or add --resize"
         )
     try:
-        imagined = world_model.rollout(
-            np.asarray(picture),
-            (command.text, *command.more_texts),
-            horizon=command.horizon,
-            seed=command.seed,
-        )
+        texts = (command.text, *command.more_texts)
+        imagined = world_model.rollout(np.asarray(picture), texts, horizon=command.horizon, seed=command.seed)
     except ValueError as error:
         raise Mistake(str(error)) from error
     print(imagined)
@@ -218,9 +214,6 @@ def _rollout(command: RolloutCommand) -> None:
 
 
 def _info(command: InfoCommand) -> None:
-    if command.checkpoint is None:
-        _models()
-        return
     console = Console()
     loaded: Any = load_model(command.checkpoint)
     model = loaded.model
@@ -239,42 +232,30 @@ def _info(command: InfoCommand) -> None:
 def _tree(name: str, settings: dict[str, Any]) -> Tree:
     tree = Tree(name)
     for key, value in settings.items():
-        if isinstance(value, dict):
-            tree.add(_tree(key, value))
-        else:
-            tree.add(f"{key} = {value}")
+        tree.add(_tree(key, value) if isinstance(value, dict) else f"{key} = {value}")
     return tree
 
 
 @dataclass(frozen=True)
 class ListedModel:
-    """A line of the list that `textocvp models` prints.
+    """A line of the list that `textocvp models` prints."""
 
-    Attributes:
-        name: of its preset or its bundled checkpoint.
-        what: what it is, in a few words.
-        parameters: those that training learns, without frozen encoders. None for a model that cannot be built here.
-        predictor: those of them that predict; of MAGE text and axial transformer, as the paper counts.
-        state: whether a checkpoint is in the package, else what training it needs: data only, or also weights.
-        weights: where its weights come from.
-    """
-
-    name: str
-    what: str
-    parameters: int | None
-    predictor: int | None
+    name: str  # of its preset or its bundled checkpoint
+    what: str  # what it is, in a few words
+    parameters: int | None  # those that training learns; None for a model that cannot be built here
+    predictor: int | None  # those that predict; of MAGE text and axial transformer, as in the paper
     state: Literal["trained here", "not trained here", "needs weights", "figures only"]
-    weights: str
+    weights: str  # where its weights come from
 
 
 # The one model of the paper's comparison that is not in this package; docs/models.md says why.
 SEER = ListedModel(
-    "seer",
-    "SEER, a latent diffusion model of 406 M parameters (as published)",
-    None,
-    None,
-    "figures only",
-    "its authors' checkpoint, which nothing here reads: see docs/models.md",
+    name="seer",
+    what="SEER, a latent diffusion model of 406 M parameters (as published)",
+    parameters=None,
+    predictor=None,
+    state="figures only",
+    weights="its authors' checkpoint, which nothing here reads: see docs/models.md",
 )
 
 

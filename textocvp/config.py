@@ -25,16 +25,9 @@ C = TypeVar("C")
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """A whole TextOCVP.
+    """A whole TextOCVP."""
 
-    Attributes:
-        KINDS: of each part, the classes that its `kind` names; their `Config` says which options there are.
-        name: the preset it came from.
-        parser, renderer, text, predictor: its four parts.
-        stage: the last stage of training that a checkpoint has been through. After `parser`, text encoder and predictor
-            are still as they were drawn.
-    """
-
+    # Of each part, the classes that its `kind` names; their `Config` says which options there are.
     KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {
         "parser": PARSERS,
         "renderer": RENDERERS,
@@ -42,11 +35,12 @@ class ModelConfig:
         "predictor": PREDICTORS,
     }
 
-    name: str
+    name: str  # the preset it came from
     parser: ParserConfig = field(default_factory=PlacedConfig)
     renderer: RendererConfig = field(default_factory=GlimpseConfig)
     text: TextConfig = field(default_factory=WordsConfig)
     predictor: PredictorConfig = field(default_factory=TextOCVPConfig)
+    # The last stage of training that it has been through. After `parser`, text encoder and predictor are as drawn.
     stage: Literal["parser", "predictor"] = "predictor"
 
     def to_dict(self) -> dict[str, Any]:
@@ -55,11 +49,7 @@ class ModelConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ModelConfig:
-        """The inverse of `to_dict`.
-
-        Raises:
-            ValueError: see `build`.
-        """
+        """The inverse of `to_dict`; errors as `build`."""
         return build(cls, data)
 
 

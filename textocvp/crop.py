@@ -1,8 +1,7 @@
 """Crops the pixels of a slot into a small canonical picture, and pastes such a picture back at the slot's place.
 
-In its own coordinates a thing looks the same wherever it stands. Both ways are axis-aligned, so each is two small
-matrix products (the separable attention of DRAW, Gregor et al. 2015) and differentiable in place and size. The explicit
-place follows Invariant Slot Attention (Biza et al. 2023).
+In its own coordinates a thing looks the same wherever it stands (Invariant Slot Attention, Biza et al. 2023). Both ways
+are two small matrix products (DRAW, Gregor et al. 2015) and differentiable in place and size.
 """
 
 from __future__ import annotations
@@ -10,8 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-NOTHING = -12.0
-"""Alpha logit outside a pasted picture and in unused slots; the background's is 0."""
+NOTHING = -12.0  # alpha logit outside a pasted picture and in unused slots; the background's is 0
 
 
 def crop(images: Tensor, position: Tensor, scale: Tensor, cells: int, extent: float) -> Tensor:

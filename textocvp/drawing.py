@@ -49,21 +49,13 @@ def save_film(
     beside: np.ndarray | None = None,
     fps: int = 6,
 ) -> Path:
-    """Write sequences as a film (`.gif`, `.mp4`) or a strip (`.png`).
+    """Write sequences as a film or a strip; see `Rollout.save`.
 
     Args:
         path: missing folders are made.
         frames: (B, T, 3, H, W) RGB 0..1.
         masks: (B, T, K, H, W).
         texts: B captions, or none.
-        beside: real frames (T', H, W, 3) or (B, T', H, W, 3) uint8, drawn before the imagined ones.
-        fps: frames per second.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: if the suffix is another one, or `beside` has another shape.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -91,14 +83,11 @@ def save_film(
 
 
 def _real_frames(beside: np.ndarray, B: int, T: int, H: int, W: int) -> np.ndarray:
-    real = np.asarray(beside)
-    if real.ndim == 4:
-        real = np.broadcast_to(real, (B, *real.shape))
+    given = np.asarray(beside)
+    real = np.broadcast_to(given, (B, *given.shape)) if given.ndim == 4 else given
     if real.ndim != 5 or real.shape[0] != B or real.shape[2:] != (H, W, 3) or real.dtype != np.uint8:
-        raise ValueError(
-            f"beside must be uint8 frames (T', {H}, {W}, 3) or ({B}, T', {H}, {W}, 3), "
-            f"not {np.asarray(beside).dtype} {np.asarray(beside).shape}"
-        )
+        allowed = f"(T', {H}, {W}, 3) or ({B}, T', {H}, {W}, 3)"
+        raise ValueError(f"beside must be uint8 frames {allowed}, not {given.dtype} {given.shape}")
     return real[:, np.minimum(np.arange(T), real.shape[1] - 1)]
 
 

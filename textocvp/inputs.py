@@ -38,9 +38,7 @@ def checked_frames(
 ) -> Tensor:
     """Images (N, H, W, 3) uint8 as frames (N, 3, H, W) in -1..1.
 
-    Args:
-        image_size: (H, W) that the model was trained on.
-        what: what messages call the images.
+    `image_size` is the (H, W) that the model was trained on; messages call the images `what`.
 
     Raises:
         TypeError: if they are not uint8.
@@ -98,11 +96,7 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
 
 
 def checked_horizon(horizon: int, longest: int | None, hint: str = "") -> None:
-    """Raise ValueError unless `horizon` is a whole number from 1 to `longest`, where there is one.
-
-    Args:
-        hint: what to do instead of asking for more than `longest`.
-    """
+    """Raise a ValueError, with a `hint`, unless `horizon` is a whole number from 1 to `longest`, if that is known."""
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(f"horizon must be a whole number of at least 1 frame, not {horizon!r}")
     if longest is not None and horizon > longest:

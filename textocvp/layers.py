@@ -22,13 +22,9 @@ def mask_bias(masked: Tensor) -> Tensor:
 
 
 def attend(q_BhNd: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Scaled dot-product attention.
+    """Scaled dot-product attention: the values (B, h, N, d), and the weights (B, h, N, M), which sum to 1 over M.
 
-    Args:
-        bias: added to the logits, broadcastable to (B, h, N, M).
-
-    Returns:
-        The attended values (B, h, N, d) and the attention (B, h, N, M), which sums to 1 over M.
+    `bias` is added to the logits and broadcastable to (B, h, N, M).
     """
     logits_BhNM = (q_BhNd * q_BhNd.shape[-1] ** -0.5) @ k_BhMd.transpose(-1, -2)
     if bias is not None:
@@ -56,14 +52,7 @@ class KeyValueCache:
         self._seen: list[Tensor] = []  # keys and values
 
     def append(self, k_BhNd: Tensor, v_BhNd: Tensor) -> tuple[Tensor, Tensor]:
-        """Add N tokens.
-
-        Returns:
-            Keys and values of all M tokens, each (B, h, M, d).
-
-        Raises:
-            ValueError: if M is more than the capacity.
-        """
+        """Add N tokens and return keys and values of all M, each (B, h, M, d); a ValueError if they are too many."""
         start, end = self.length, self.length + k_BhNd.shape[2]
         if end > self.capacity:
             raise ValueError(f"the cache holds {self.capacity} tokens, {end} were given")
@@ -99,11 +88,7 @@ class SelfAttention(nn.Module):
         newest: int | None = None,
         cache: KeyValueCache | None = None,
     ) -> Tensor:
-        """Attend from the last `newest` tokens (default: all) to all tokens and to those in the cache.
-
-        Returns:
-            (B, N, C), where N is `newest`.
-        """
+        """(B, N, C): the last N = `newest` tokens (default: all) attend to all tokens and to those in the cache."""
         dim = x_BMC.shape[-1]
         if newest is None:
             q_BNC, k_BMC, v_BMC = self.qkv(x_BMC).chunk(3, dim=-1)
@@ -127,8 +112,6 @@ class TextAttention(nn.Module):
 
     def __init__(self, dim: int, heads: int, text_dim: int) -> None:
         super().__init__()
-        if dim % heads:
-            raise ValueError(f"width {dim} cannot be divided into {heads} heads")
         self.heads = heads
         self.norm_text = nn.LayerNorm(text_dim, eps=1e-6)
         self.q = nn.Linear(dim, dim, bias=False)
@@ -163,10 +146,7 @@ def full_precision(device: torch.device) -> AbstractContextManager[object]:
 
 
 def pixel_grid(height: int, width: int, *, device: torch.device | str | None = None) -> Tensor:
-    """The pixel centres in the unit of `SlotState.position`, (height, width, 2) of (x, y), float32.
-
-    The picture's edges are at -1 and 1, so the first of W pixel centres is at 1/W - 1.
-    """
+    """The pixel centres (x, y) in the unit of `SlotState.position`, (height, width, 2) float32; edges are -1 and 1."""
     y = (torch.arange(height, device=device, dtype=torch.float32) + 0.5) * (2 / height) - 1
     x = (torch.arange(width, device=device, dtype=torch.float32) + 0.5) * (2 / width) - 1
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
@@ -188,11 +168,8 @@ class PositionCode(nn.Module):
 
 
 def init_relu_(module: nn.Module) -> None:
-    """Initial weights with which ReLU layers keep the scale of their input (He et al. 2015).
-
-    With PyTorch's own the signal shrinks from layer to layer, and an autoencoder draws the mean picture for hundreds
-    of updates.
-    """
+    """Initial weights with which ReLU layers keep the scale of their input (He et al. 2015)."""
+    # With PyTorch's own it shrinks from layer to layer: an autoencoder draws the mean picture for hundreds of updates.
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")

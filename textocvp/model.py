@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from huggingface_hub import PyTorchModelHubMixin
@@ -37,14 +38,7 @@ class TextOCVP(
     library_name="textocvp",
     tags=["world-model", "object-centric", "video-prediction"],
 ):
-    """The text-conditioned object-centric video predictor.
-
-    Attributes:
-        config: every choice of architecture.
-        parser: frames to slots.
-        text: sentences to tokens.
-        predictor: slots and tokens to the slots of the next frames.
-        renderer: slots to frames and masks.
+    """The text-conditioned object-centric video predictor: `parser`, `text`, `predictor`, `renderer`.
 
     Args:
         text_files: the text encoder's own folder, of a checkpoint that is being loaded.
@@ -78,28 +72,18 @@ class TextOCVP(
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
-        cls,
-        pretrained_model_name_or_path: str | Path,
-        *,
-        revision: str | None = None,
-        cache_dir: str | Path | None = None,
-        local_files_only: bool = False,
-        token: str | bool | None = None,
-        device: str | torch.device = "cpu",
+        cls, name: str | Path, *, device: str | torch.device = "cpu", **hub: Any
     ) -> TextOCVP:
         """Load a checkpoint, in evaluation mode.
 
         Args:
-            pretrained_model_name_or_path: as in `resolve_checkpoint`: a bundled name, a folder or a hub id.
-            revision, cache_dir, local_files_only, token: as in `huggingface_hub.snapshot_download`; hub only.
-            device: where to put the model.
+            name: a bundled name, a folder or a hub id.
+            hub: as in `huggingface_hub.snapshot_download`, for example `revision`.
 
         Raises:
-            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is
-                named.
+            CheckpointError: if a file is missing or damaged, or a config field or tensor does not fit; it is named.
         """
-        hub = dict(revision=revision, cache_dir=cache_dir, local_files_only=local_files_only, token=token)
-        with resolve_checkpoint(pretrained_model_name_or_path, **hub) as folder:
+        with resolve_checkpoint(name, **hub) as folder:
             config = read_config(folder)
             try:
                 model = cls(config, folder / TEXT_FOLDER)
@@ -114,9 +98,8 @@ def check_parts(config: ModelConfig) -> None:
     parser, renderer, text = config.parser, config.renderer, config.text
     layout, side = parser.layout, parser.image_size
     if isinstance(renderer, GlimpseConfig) and not layout.explicit:
-        raise ValueError(
-            "renderer.kind 'glimpse' needs parser.layout.explicit = true: it draws a slot at its own place"
-        )
+        needs = "parser.layout.explicit = true: it draws a slot at its own place"
+        raise ValueError(f"renderer.kind 'glimpse' needs {needs}")
     if isinstance(renderer, UpsampleConfig):
         if layout.explicit or parser.num_slots != 1:
             raise ValueError(
@@ -130,30 +113,21 @@ def check_parts(config: ModelConfig) -> None:
         raise ValueError(f"renderer.patches: {renderer.patches} patches do not divide {side} pixels evenly")
     if isinstance(renderer, FeatureConfig):
         if parser.features is None:
-            raise ValueError(
-                "renderer.kind 'features' redraws the features of a frozen encoder: set parser.kind=savi and "
-                "parser.encoder=dinov2"
-            )
-        cells, width = parser.features
-        for name, has, wanted in (
-            ("renderer.feature_dim", renderer.feature_dim, width),
-            ("renderer.patches", renderer.patches, cells),
-        ):
+            way = "set parser.kind=savi and parser.encoder=dinov2"
+            raise ValueError(f"renderer.kind 'features' redraws the features of a frozen encoder: {way}")
+        for name, wanted in zip(("patches", "feature_dim"), parser.features, strict=True):
+            has = getattr(renderer, name)
             if has != wanted:
-                raise ValueError(
-                    f"{name} is {has}, the encoder's features have {wanted}: set {name}={wanted}"
-                )
+                way = f"set renderer.{name}={wanted}"
+                raise ValueError(f"renderer.{name} is {has}, the encoder's features have {wanted}: {way}")
     if getattr(config.predictor, "color_bias", False):  # an option of predictors that attend to the text
+        needs = ""
         if not text.words_have_rgb:
-            raise ValueError(
-                "predictor.color_bias=true needs words that carry RGB, which is text.kind=lexicon, not "
-                f"{text.kind!r}: set predictor.color_bias=false"
-            )
-        if not layout.explicit:
-            raise ValueError(
-                "predictor.color_bias=true needs slots with explicit colour (parser.layout.explicit = true): set "
-                "predictor.color_bias=false"
-            )
+            needs = f"words that carry RGB, which is text.kind=lexicon, not {text.kind!r}"
+        elif not layout.explicit:
+            needs = "slots with explicit colour (parser.layout.explicit = true)"
+        if needs:
+            raise ValueError(f"predictor.color_bias=true needs {needs}: set predictor.color_bias=false")
 
 
 @contextmanager

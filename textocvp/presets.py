@@ -15,15 +15,22 @@ from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.patches import FeatureConfig, PatchConfig
 from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
-from textocvp.text.words import GRAMMAR, TRAIN_COLORS, WordsConfig
+from textocvp.text.words import WordsConfig
 
+# The words of the tabletop's sentences and its training colours. They keep their rows whatever the captions say, and
+# with them a seed keeps its weights.
+TABLETOP_WORDS = ("put", "the", "block", "in", "bowl", "and", "then", "into", "a", "on", "place", "move", "of", "with",
+                  "to")  # fmt: skip
+TABLETOP_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
+
+SMALL_TEXT = WordsConfig(vocabulary=TABLETOP_WORDS)
+PUBLISHED_TEXT = WordsConfig(
+    kind="transformer", dim=512, heads=8, hidden=1024, vocabulary=TABLETOP_WORDS + TABLETOP_COLORS
+)
 SMALL = TextOCVPConfig(dim=128, layers=3, heads=4, hidden=256, attention="causal", window=24, feed_forwards=1)
 SMALL_SEQ = OCVPSeqConfig(dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24)
 PUBLISHED = TextOCVPConfig()
 PUBLISHED_SEQ = OCVPSeqConfig(dim=128, layers=2, heads=4, hidden=256, age_encoding="sinusoidal")
-PUBLISHED_TEXT = WordsConfig(
-    kind="transformer", dim=512, heads=8, hidden=1024, vocabulary=GRAMMAR + TRAIN_COLORS
-)
 PUBLISHED_SAVI = SaviConfig(
     num_slots=8,
     layout=SlotLayout(content=128, explicit=False),
@@ -36,14 +43,14 @@ TABLETOP_SMALL = ModelConfig(
     name="tabletop-small",
     parser=PlacedConfig(),
     renderer=GlimpseConfig(),
-    text=WordsConfig(),
+    text=SMALL_TEXT,
     predictor=replace(SMALL, color_bias=True),
 )
 SAVI_SMALL = ModelConfig(
     name="savi-small",
     parser=SaviConfig(encoder_stride=2, iterations_first=3),
     renderer=PatchConfig(hidden=64, mask_prior=True),
-    text=WordsConfig(),
+    text=SMALL_TEXT,
     predictor=SMALL,
 )
 SAVI_CATER = ModelConfig(
@@ -65,7 +72,7 @@ NON_OC_SMALL = ModelConfig(
     name="non-oc-small",
     parser=HolisticConfig(pool_cells=4),
     renderer=UpsampleConfig(),
-    text=WordsConfig(),
+    text=SMALL_TEXT,
     predictor=replace(SMALL, standardize=True),
 )
 NON_OC = ModelConfig(
@@ -78,19 +85,8 @@ NON_OC = ModelConfig(
 OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
 OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
 
-PRESETS = {
-    one.name: one
-    for one in (
-        TABLETOP_SMALL,
-        SAVI_SMALL,
-        SAVI_CATER,
-        CLIPORT_DINO,
-        OCVP_SEQ_SMALL,
-        OCVP_SEQ,
-        NON_OC_SMALL,
-        NON_OC,
-    )
-}
+_ALL = TABLETOP_SMALL, SAVI_SMALL, SAVI_CATER, CLIPORT_DINO, OCVP_SEQ_SMALL, OCVP_SEQ, NON_OC_SMALL, NON_OC
+PRESETS = {one.name: one for one in _ALL}
 
 # What `textocvp models` says of each preset and bundled checkpoint.
 DESCRIPTIONS = {
@@ -110,11 +106,7 @@ DESCRIPTIONS = {
 
 
 def preset(name: str) -> ModelConfig:
-    """The preset of that name.
-
-    Raises:
-        KeyError: if there is none; the message lists those that exist.
-    """
+    """The preset of that name; else a KeyError lists those that exist."""
     try:
         return PRESETS[name]
     except KeyError:

@@ -10,17 +10,17 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from huggingface_hub import snapshot_download
-from transformers import PretrainedConfig, PreTrainedModel
-from transformers.utils import logging
+
+if TYPE_CHECKING:  # importing transformers takes seconds, and most models need none of it
+    from transformers import PretrainedConfig, PreTrainedModel
 
 CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE = "config.json", "model.safetensors", "tokenizer.json"
 
-M = TypeVar("M", bound=PreTrainedModel)
+M = TypeVar("M", bound="PreTrainedModel")
 
 
 class WeightsError(ValueError):
@@ -29,21 +29,13 @@ class WeightsError(ValueError):
 
 @dataclass(frozen=True)
 class PretrainedFiles:
-    """The files of a pretrained encoder, and the words in which messages speak of it.
+    """The files of a pretrained encoder, and how messages name them."""
 
-    Attributes:
-        what: the encoder, for example "the image encoder".
-        setting: the field of the configuration that says where the files are.
-        fingerprint_setting: the field that says which weights they are.
-        hub_id: the repository to take where `setting` is empty.
-        files: names of the files; all but `config.json` count for the fingerprint.
-    """
-
-    what: str
-    setting: str
-    fingerprint_setting: str
-    hub_id: str
-    files: tuple[str, ...] = (CONFIG_FILE, WEIGHTS_FILE)
+    what: str  # the encoder, for example "the image encoder"
+    setting: str  # the field of the configuration that says where the files are
+    fingerprint_setting: str  # the field that says which weights they are
+    hub_id: str  # the repository to take where `setting` is empty
+    files: tuple[str, ...] = (CONFIG_FILE, WEIGHTS_FILE)  # all but `config.json` count for the fingerprint
 
     def folder(self, name: str = "") -> Path:
         """The folder of that name, or the one into which the repository `name` of the Hugging Face hub was fetched.
@@ -67,20 +59,12 @@ class PretrainedFiles:
                 ) from error
         missing = [file for file in self.files if not (folder / file).is_file()]
         if missing:
-            raise WeightsError(
-                f"{self.what}: {folder} lacks {', '.join(missing)}; it must contain {', '.join(self.files)}"
-            )
+            needs = f"it must contain {', '.join(self.files)}"
+            raise WeightsError(f"{self.what}: {folder} lacks {', '.join(missing)}; {needs}")
         return folder
 
     def fingerprint(self, folder: Path, wanted: str = "") -> str:
-        """The hash of the weights in `folder`.
-
-        Args:
-            wanted: the hash that they must have; empty for any.
-
-        Raises:
-            WeightsError: if they have another.
-        """
+        """The hash of the weights in `folder`; a WeightsError if another is `wanted`."""
         digest = hashlib.sha256()
         for name in self.files:
             if name != CONFIG_FILE:
@@ -96,11 +80,7 @@ class PretrainedFiles:
         return found
 
     def architecture(self, folder: Path, kind: type[PretrainedConfig]) -> PretrainedConfig:
-        """The architecture in `folder`/config.json.
-
-        Raises:
-            WeightsError: if it is damaged or of another kind.
-        """
+        """The architecture in `folder`/config.json; a WeightsError if it is damaged or of another kind."""
         path = folder / CONFIG_FILE
         try:
             data: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -108,25 +88,13 @@ class PretrainedFiles:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise WeightsError(f"{path} is missing or damaged: {type(error).__name__}: {error}") from error
         if found != kind.model_type:
-            raise WeightsError(
-                f"{self.what} reads models of the type {kind.model_type!r}, {path} is of the type {found!r}"
-            )
+            needs = f"{self.what} reads models of the type {kind.model_type!r}"
+            raise WeightsError(f"{needs}, {path} is of the type {found!r}")
         return kind.from_dict(data)
 
 
-def package_folder(package: str) -> Path | None:
-    """Where an installed Python package lies; None if it is not installed."""
-    found = find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        return None
-    return Path(found.submodule_search_locations[0])
-
-
 def read_model(kind: type[M], folder: Path, **options: Any) -> M:
-    """The model in `folder`, in float32. What else the file holds (a decoder, a head) is left.
-
-    Args:
-        options: as in `kind.from_pretrained`.
+    """The model in `folder`, in float32, without what else the file holds (a decoder, a head).
 
     Raises:
         WeightsError: if the file is damaged, or a tensor is missing or of another shape.
@@ -154,6 +122,8 @@ def read_model(kind: type[M], folder: Path, **options: Any) -> M:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep transformers from reporting what is checked here anyway."""
+    from transformers.utils import logging
+
     verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()

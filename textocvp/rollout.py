@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +20,10 @@ from textocvp.layers import pixel_grid
 from textocvp.renderers.base import Renderer
 from textocvp.slots import SlotLayout, SlotState
 
-CHUNK = 64
-"""Pictures that the renderer draws at once: enough to keep two cores busy, and small enough for their cache."""
+CHUNK = 64  # pictures that the renderer draws at once: enough to keep two cores busy, and few enough for their cache
+
+
+Draw = Callable[[Tensor], tuple[Tensor, ...]]  # of slots (N, K, D)
 
 
 @dataclass
@@ -37,21 +40,14 @@ class Rollout:
 
     All tensors are float32 without gradient, on the model's device. Slots keep their number through time: slot 3 of
     frame 20 is the thing that was slot 3 in frame 0.
-
-    Attributes:
-        slots: (B, T, K, D).
-        texts: the B instructions; empty if the rollout comes from `WorldModel.parse`.
-        image_size: (H, W) in pixels.
-        layout: what the D numbers of a slot mean.
-        renderer: draws the slots.
-        attention: (B, T - 1, layers, heads, K, words) weights from slots to words, if they were asked for.
     """
 
-    slots: Tensor
-    texts: tuple[str, ...]
-    image_size: tuple[int, int]
-    layout: SlotLayout
-    renderer: Renderer
+    slots: Tensor  # (B, T, K, D)
+    texts: tuple[str, ...]  # the B instructions; empty if the rollout comes from `WorldModel.parse`
+    image_size: tuple[int, int]  # (H, W) in pixels
+    layout: SlotLayout  # what the D numbers of a slot mean
+    renderer: Renderer  # draws the slots
+    # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for.
     attention: Tensor | None = None
     _decoded: _Decoded = field(default_factory=_Decoded)
 
@@ -71,11 +67,7 @@ class Rollout:
     # ---- what the slots look like
 
     def decode_masks(self, frames: slice | Sequence[int]) -> Tensor:
-        """Masks (B, t, K, H, W) of only these frames; see `masks`.
-
-        Raises:
-            IndexError: if there is no such frame.
-        """
+        """Masks (B, t, K, H, W) of only these frames; an IndexError if there is no such frame."""
         times, decoded = self._times(frames), self._decoded.masks
         new = [t for t in dict.fromkeys(times) if t not in decoded]
         if new:
@@ -84,11 +76,7 @@ class Rollout:
         return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_frames(self, frames: slice | Sequence[int]) -> Tensor:
-        """Pictures (B, t, 3, H, W) of only these frames; see `frames`.
-
-        Raises:
-            IndexError: if there is no such frame.
-        """
+        """Pictures (B, t, 3, H, W), RGB 0..1, of only these frames; an IndexError if there is no such frame."""
 
         def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
             rendered = self.renderer(slots_NKD)
@@ -104,10 +92,10 @@ class Rollout:
         return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_objects(self, frames: slice | Sequence[int]) -> Tensor:
-        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames.
+        """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames. These pictures are not kept.
 
         A picture fills the whole frame; multiply it by its mask to cut the object out. Summed over the slots that
-        gives the frame, unless the renderer overshoots 0..1. These pictures are not kept.
+        gives the frame, unless the renderer overshoots 0..1.
 
         Raises:
             IndexError: if there is no such frame.
@@ -129,17 +117,14 @@ class Rollout:
         return self.decode_frames(slice(None))
 
     def _times(self, frames: slice | Sequence[int]) -> list[int]:
-        """Frame numbers 0..T-1 of a slice or of numbers that may count from the end."""
         T = self.slots.shape[1]
-        times = list(range(T)[frames]) if isinstance(frames, slice) else [range(T)[int(t)] for t in frames]
+        times = _numbers(T, frames)
         if not times:
             raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
         return times
 
     @torch.no_grad()
-    def _draw(
-        self, times: list[int], draw: Callable[[Tensor], tuple[Tensor, ...]], at_once: int = CHUNK
-    ) -> list[Tensor]:
+    def _draw(self, times: list[int], draw: Draw, at_once: int = CHUNK) -> list[Tensor]:
         """What `draw` makes of these frames' slots (N, K, D): its results, each (B, t, ...)."""
         B, _, K, D = self.slots.shape
         drawn = [draw(slots_NKD) for slots_NKD in self.slots[:, times].reshape(-1, K, D).split(at_once)]
@@ -204,40 +189,28 @@ class Rollout:
         Raises:
             IndexError: if there is no such sequence.
         """
-        B = len(self)
-        if isinstance(index, slice):
-            keep = list(range(B)[index])
-        elif isinstance(index, Sequence) or np.ndim(index):
-            keep = [range(B)[int(i)] for i in index]  # type: ignore[union-attr]
-        else:
-            keep = [range(B)[int(index)]]
+        keep = _numbers(
+            len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index]
+        )
+        decoded = self._decoded
+        kept = ({t: drawn[keep] for t, drawn in kind.items()} for kind in (decoded.masks, decoded.frames))
         return replace(
             self,
             slots=self.slots[keep],
             texts=tuple(self.texts[i] for i in keep) if self.texts else (),
             attention=None if self.attention is None else self.attention[keep],
-            _decoded=_Decoded(
-                {t: masks[keep] for t, masks in self._decoded.masks.items()},
-                {t: frames[keep] for t, frames in self._decoded.frames.items()},
-            ),
+            _decoded=_Decoded(*kept),
         )
 
     @property
     def last(self) -> Rollout:
         """The rollout of only the last frame: where a next instruction would start from."""
-        end = self.slots.shape[1] - 1
-        return replace(
-            self,
-            slots=self.slots[:, -1:],
-            attention=None,
-            _decoded=_Decoded(
-                {0: self._decoded.masks[end]} if end in self._decoded.masks else {},
-                {0: self._decoded.frames[end]} if end in self._decoded.frames else {},
-            ),
-        )
+        end, decoded = self.slots.shape[1] - 1, self._decoded
+        kept = ({0: kind[end]} if end in kind else {} for kind in (decoded.masks, decoded.frames))
+        return replace(self, slots=self.slots[:, -1:], attention=None, _decoded=_Decoded(*kept))
 
     def save(self, path: str | Path, *, beside: np.ndarray | None = None, fps: int = 6) -> Path:
-        """Draw the rollout into a file: each frame with its masks, in one stable colour for each slot.
+        """Draw frames and masks, in one stable colour for each slot, into a file; returns its path.
 
         Args:
             path: `.gif` and `.mp4` play through time, `.png` is a strip from left to right.
@@ -245,14 +218,16 @@ class Rollout:
                 earlier than the rollout, the last one stays.
             fps: frames per second of `.gif` and `.mp4`.
 
-        Returns:
-            The path.
-
         Raises:
             ValueError: if the suffix is another one, or `beside` has another shape.
         """
         frames, masks = self.frames.cpu().numpy(), self.masks.cpu().numpy()
         return save_film(Path(path), frames, masks, self.texts, beside=beside, fps=fps)
+
+
+def _numbers(count: int, index: Any) -> list[int]:
+    """The numbers 0..count-1 of a slice, or of numbers that may count from the end."""
+    return list(range(count)[index]) if isinstance(index, slice) else [range(count)[int(i)] for i in index]
 
 
 def _to_rgb(pictures: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """What the numbers of a slot mean.
 
-A set of slots is one tensor everywhere, `slots_BKD`, or `slots_BTKD` for a sequence. In the published model the
-D numbers are one learned vector. In the shipped model a slot also states its colour, place, size and presence, which
-the predictor moves, the renderer draws and the planner reads. `SlotLayout` says which of the D numbers are which.
+A set of slots is one tensor everywhere, `slots_BKD`, or `slots_BTKD` for a sequence. In the published model the D
+numbers are one learned vector. In the shipped model a slot also states its colour, place, size and presence, which the
+predictor moves, the renderer draws and the planner reads.
 """
 
 from __future__ import annotations
@@ -20,20 +20,15 @@ PRESENCE_UNUSED, PRESENCE_THING, PRESENCE_BACKGROUND = 0.0, 1.0, 2.0
 MIN_USED = (PRESENCE_UNUSED + PRESENCE_THING) / 2
 MIN_BACKGROUND = (PRESENCE_THING + PRESENCE_BACKGROUND) / 2
 
-MIN_SCALE = 0.012
-"""Smallest standard deviation of a slot, in -1..1: about a third of a pixel at 64x64."""
+MIN_SCALE = 0.012  # smallest standard deviation of a slot, in -1..1: about a third of a pixel at 64x64
 
 
 @dataclass(frozen=True)
 class SlotLayout:
-    """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`.
+    """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`."""
 
-    Attributes:
-        content: number of learned channels, which have no fixed meaning.
-        explicit: whether the 8 explicit channels follow the content. In the published form they do not: D = content.
-    """
-
-    content: int
+    content: int  # number of learned channels, which have no fixed meaning
+    # Whether the 8 explicit channels follow; in the published form they do not: D = content.
     explicit: bool = True
 
     @property
@@ -50,21 +45,13 @@ class SlotLayout:
 
 @dataclass
 class SlotState:
-    """A slot tensor taken apart. Leading axes `...` are any of (B, K), (B, T, K).
+    """A slot tensor taken apart. Leading axes `...` are any of (B, K), (B, T, K)."""
 
-    Attributes:
-        content: (..., C) learned channels.
-        color: (..., 3) mean RGB of the slot's pixels, -1..1 as in the model's frames.
-        position: (..., 2) centre of mass (x, y), -1..1 from left to right and top to bottom.
-        scale: (..., 2) standard deviation of the slot's pixels along x and y, same unit as position, positive.
-        presence: (..., 1) `PRESENCE_UNUSED`, `PRESENCE_THING` or `PRESENCE_BACKGROUND`.
-    """
-
-    content: Tensor
-    color: Tensor
-    position: Tensor
-    scale: Tensor
-    presence: Tensor
+    content: Tensor  # (..., C) learned channels
+    color: Tensor  # (..., 3) mean RGB of the slot's pixels, -1..1 as in the model's frames
+    position: Tensor  # (..., 2) centre of mass (x, y), -1..1 from left to right and top to bottom
+    scale: Tensor  # (..., 2) standard deviation of the slot's pixels along x and y, same unit as position, positive
+    presence: Tensor  # (..., 1) `PRESENCE_UNUSED`, `PRESENCE_THING` or `PRESENCE_BACKGROUND`
 
     @property
     def is_unused(self) -> Tensor:

@@ -21,12 +21,7 @@ __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoint
 
 
 class WorldModel:
-    """Imagines what happens to a scene when a sentence is carried out.
-
-    Attributes:
-        model: the network.
-        checkpoint: where it came from.
-    """
+    """Imagines what happens to a scene when a sentence is carried out."""
 
     def __init__(self, model: TextOCVP, checkpoint: Checkpoint | None = None) -> None:
         self.model = model.eval()
@@ -39,13 +34,12 @@ class WorldModel:
         """Load a checkpoint.
 
         Args:
-            name_or_folder_or_hub_id: a bundled name (`bundled_checkpoints()`), else a folder, else the id
-                `owner/name` of a repository on the Hugging Face hub.
+            name_or_folder_or_hub_id: a bundled name (`bundled_checkpoints()`), else a folder, else the id `owner/name`
+                of a repository on the Hugging Face hub.
             device: where the model computes.
 
         Raises:
-            CheckpointError: if there is no such checkpoint (the message lists the bundled ones), or it is
-                damaged.
+            CheckpointError: if there is no such checkpoint (the message lists the bundled ones), or it is damaged.
         """
         name = str(name_or_folder_or_hub_id)
         with resolve_checkpoint(name) as folder:
@@ -110,12 +104,8 @@ class WorldModel:
             UserWarning: if the text encoder does not know a word, which is named, or if the predictor is untrained.
         """
         if self.model.config.stage == "parser":
-            warnings.warn(
-                f"{self.checkpoint.name} has been through the first stage of training only: it can parse, but what it "
-                "imagines is noise",
-                UserWarning,
-                stacklevel=2,
-            )
+            only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
+            warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=2)
         texts = checked_texts(text, self.model.text)
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
         checked_horizon(horizon, self.longest_horizon, hint)
@@ -146,8 +136,7 @@ class WorldModel:
 
         Args:
             video: (T, H, W, 3) or (B, T, H, W, 3) uint8.
-            seed: of the initial slots.
-            num_slots: how many slots to use, as in `rollout`.
+            seed, num_slots: as in `rollout`.
 
         Raises:
             TypeError, ValueError: as `rollout`.
@@ -162,11 +151,7 @@ class WorldModel:
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
     def words(self, text: str) -> list[str]:
-        """A sentence as the text encoder splits it: what the last axis of `Rollout.attention` stands for.
-
-        Raises:
-            TypeError: if the text is not a string.
-        """
+        """A sentence as the text encoder splits it: what the last axis of `Rollout.attention` stands for."""
         if not isinstance(text, str):
             raise TypeError(f"a text must be a string, not {type(text).__name__}")
         return self.model.text.words(text)
@@ -181,9 +166,10 @@ class WorldModel:
         self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int, num_slots: int | None
     ) -> Tensor:
         if isinstance(obs, Rollout):
-            if num_slots is not None and num_slots != obs.slots.shape[2]:
+            own = obs.slots.shape[2]
+            if num_slots not in (None, own):
                 raise ValueError(
-                    f"this rollout goes on with its own {obs.slots.shape[2]} slots; num_slots={num_slots} is for images"
+                    f"this rollout goes on with its own {own} slots; num_slots={num_slots} is for images"
                 )
             if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
                 raise ValueError(
@@ -195,11 +181,5 @@ class WorldModel:
         return self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
 
     def _as_rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...], attention: Tensor | None) -> Rollout:
-        return Rollout(
-            slots=slots_BTKD,
-            texts=texts,
-            image_size=self.image_size,
-            layout=self.model.parser.layout,
-            renderer=self.model.renderer,
-            attention=attention,
-        )
+        model = self.model
+        return Rollout(slots_BTKD, texts, self.image_size, model.parser.layout, model.renderer, attention)

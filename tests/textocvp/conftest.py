@@ -14,14 +14,15 @@ from textocvp.parsers.holistic import HolisticConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.parsers.savi import SaviConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
+from textocvp.presets import TABLETOP_COLORS, TABLETOP_WORDS
 from textocvp.renderers.broadcast import BroadcastConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
-from textocvp.text.words import GRAMMAR, TRAIN_COLORS, WordsConfig
+from textocvp.text.words import WordsConfig
 from textocvp.world_model import WorldModel
 
-SMALL_TEXT = WordsConfig(dim=16, layers=1, heads=2, hidden=16)
+SMALL_TEXT = WordsConfig(dim=16, layers=1, heads=2, hidden=16, vocabulary=TABLETOP_WORDS)
 
 PLACED = ModelConfig(
     name="tiny-placed",
@@ -46,7 +47,7 @@ PUBLISHED = ModelConfig(
         transition_hidden=16,
     ),
     renderer=BroadcastConfig(channels=8),
-    text=replace(SMALL_TEXT, kind="transformer", vocabulary=GRAMMAR + TRAIN_COLORS),
+    text=replace(SMALL_TEXT, kind="transformer", vocabulary=TABLETOP_WORDS + TABLETOP_COLORS),
     predictor=TextOCVPConfig(dim=16, layers=2, heads=2, hidden=16, attention="window", window=4),
 )
 

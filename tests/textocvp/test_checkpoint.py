@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from textocvp import checkpoint
 from textocvp.checkpoint import CheckpointError, bundled_checkpoints, read_config, resolve_checkpoint
 from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
+from textocvp.presets import PRESETS
 from textocvp.protocols import load_model
 from textocvp.text.words import SPECIAL
 
@@ -75,7 +77,8 @@ def test_bundled_words_are_the_tensors_rows_and_untrained_ones_are_warned_about(
 
 def test_another_word_in_a_preset_breaks_no_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = TextOCVP.from_pretrained(folder).text(["put the red block"]).embeddings_BLC
-    monkeypatch.setattr("textocvp.text.words.GRAMMAR", ("stack", *PLACED.text.vocabulary))
+    changed = replace(PLACED.text, vocabulary=("stack", *PLACED.text.vocabulary))
+    monkeypatch.setitem(PRESETS, PLACED.name, replace(PLACED, text=changed))
     after = TextOCVP.from_pretrained(folder).text(["put the red block"]).embeddings_BLC
     assert torch.equal(before, after)
     data = json.loads((folder / "config.json").read_text())

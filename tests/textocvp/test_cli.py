@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -102,8 +102,6 @@ def test_models_says_of_every_preset_what_it_is(capsys) -> None:
     for entry in cli.list_models():
         counts = ["-" if n is None else f"{n:,}" for n in (entry.parameters, entry.predictor)]
         assert [entry.name, entry.what, *counts, entry.state, entry.weights] in rows
-    assert cli.main(["info"]) == 0
-    assert capsys.readouterr().out == printed
 
 
 def test_info_about_a_damaged_checkpoint_names_the_file(capsys, checkpoint) -> None:
@@ -156,11 +154,11 @@ def test_wrong_options_exit_with_two(capsys) -> None:
     assert stop.value.code == 2
 
 
-def test_the_module_runs_as_a_program(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "textocvp.cli", "info", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 1 and "config.json" in done.stderr and "Traceback" not in done.stderr
+def test_the_module_runs_as_a_program(capsys, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["textocvp", "info", str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "textocvp.cli")
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module("textocvp.cli", run_name="__main__", alter_sys=True)
+    assert stop.value.code == 1
+    message = capsys.readouterr().err
+    assert "config.json" in message and "Traceback" not in message

@@ -52,7 +52,7 @@ def test_both_stages_stay_on_the_device(config: ModelConfig) -> None:
     true = slots[:, 3 - predicted.shape[1] :]
     std = torch.ones(layout.content, device="meta")
     counted = moving_weights(true, layout, 20.0, ever=False)
-    slot_loss(predicted, true[:, 1:], counted, layout, std, whole=1.0).total(0.1, 0.3).backward()
+    slot_loss(predicted, true[:, 1:], counted, layout, std).total(0.1, 0.3).backward()
     assert {p.grad.device.type for p in dynamics.parameters() if p.grad is not None} == {"meta"}
     assert model.renderer(slots[:, 0]).masks_BKHW.device.type == "meta"
 

@@ -21,8 +21,9 @@ from textocvp.world_model import bundled_checkpoints
 
 
 def entries() -> dict[str, ListedModel]:
-    found = {entry.name: entry for entry in list_models()}
-    assert len(found) == len(list_models())
+    listed = list_models()
+    found = {entry.name: entry for entry in listed}
+    assert len(found) == len(listed)
     return found
 
 

@@ -15,11 +15,7 @@ FORMATS: dict[str, type[Episodes]] = {
 
 
 def open_episodes(path: str | os.PathLike[str], first: int | None = None) -> Episodes:
-    """Open episodes of whichever format.
-
-    Args:
-        path: a file or folder.
-        first: use only the first so many episodes.
+    """Open the file or folder at `path`, of whichever format; with `first`, only the first so many episodes.
 
     Raises:
         FileNotFoundError: when there is nothing at `path`.

@@ -1,8 +1,7 @@
 """What frozen networks make of every frame, computed once: slots, features of image encoders, codes.
 
-A cache is a folder of HDF5 files of a few episodes each: `values` (N, ...), one row a frame. Every file remembers which
-network and which episodes it was made from, and is refused for others. Computing goes on where it was killed, and
-several processes can share it.
+A cache is a folder of HDF5 files of a few episodes each: `values` (N, ...), one row a frame. A file is refused for
+another network or other episodes than it was made from. Computing goes on where it was killed.
 """
 
 from __future__ import annotations
@@ -31,19 +30,16 @@ CHUNK = 1 << 20  # bytes that are read at once, or one frame where that is more
 
 
 class CacheError(ValueError):
-    """A cache belongs to another network or other episodes, is not complete or damaged; the message says which."""
+    """A cache belongs to another network or other episodes, is incomplete or damaged; the message says which."""
 
 
 class FrameCache:
     """One value for each frame of some episodes, on disk. Picklable, and safe to use after a fork: no file stays open.
 
     Args:
-        folder: where the files are; those that are missing are made by `fill`.
+        folder: where the files are; `fill` makes those that are missing.
         episodes: whose frames they are.
         network: fingerprint of what computes the values.
-
-    Attributes:
-        instructions: the sentence of each episode.
 
     Raises:
         CacheError: if a file is damaged, or was made by another network or from other episodes.
@@ -64,7 +60,7 @@ class FrameCache:
         """Compute every `processes`-th part, from part number `process` on, unless it is there already.
 
         Args:
-            compute: the values (N, ...) of all frames of these episodes, one episode after another.
+            compute: gives the values (N, ...) of all frames of these episodes, one episode after another.
 
         Returns:
             itself.
@@ -89,11 +85,7 @@ class FrameCache:
 
     @cached_property
     def values(self) -> NDArray[Any]:
-        """The values (N, ...) of all frames, in memory.
-
-        Raises:
-            CacheError: if a part is missing.
-        """
+        """The values (N, ...) of all frames, in memory; a CacheError if a part is missing."""
         return np.concatenate([self._read(first, slice(None)) for first in self._firsts])
 
     def episode(self, index: int) -> NDArray[Any]:
@@ -116,12 +108,10 @@ class FrameCache:
         """
         edges = self.starts[::PART]
         parts = np.searchsorted(edges, starts, side="right") - 1
-        rows = starts - edges[parts]
-        read = [
-            self._read(self._firsts[part], slice(row, row + length, stride))
-            for part, row in zip(parts, rows, strict=True)
-        ]
-        return np.stack(read)
+        pairs = zip(parts, starts - edges[parts], strict=True)
+        return np.stack(
+            [self._read(self._firsts[part], slice(at, at + length, stride)) for part, at in pairs]
+        )
 
     def _path(self, first: int) -> Path:
         return self.folder / f"{first:06d}.h5"
@@ -160,12 +150,9 @@ def weights_fingerprint(module: nn.Module, *also: str) -> str:
     return digest.hexdigest()
 
 
-# ---- slots
-
-
 def parser_fingerprint(model: TextOCVP) -> str:
-    """A hash of the parser's configuration and weights; of a frozen encoder's weights, their fingerprint."""
-    # Where the frozen encoder's weights lie changes nothing; which they are is in the configuration, too.
+    """A hash of the parser's configuration and weights."""
+    # Of a frozen encoder the configuration has the fingerprint; where its weights lie changes nothing.
     settings = {k: v for k, v in model.config.to_dict()["parser"].items() if k != "encoder_weights"}
     return weights_fingerprint(model.parser, json.dumps(settings, sort_keys=True))
 
@@ -173,32 +160,25 @@ def parser_fingerprint(model: TextOCVP) -> str:
 def cached_slots(
     model: TextOCVP, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1
 ) -> FrameCache:
-    """The slots (K, D) float16 of every frame; those that are not in `folder` yet are found and written there.
-
-    Args:
-        process, processes: which share of the work is this process's.
+    """The slots (K, D) float16 of every frame; this process's share of those that `folder` lacks is computed.
 
     Raises:
         CacheError: if `folder` holds the slots of another parser or of other episodes.
     """
-    cache = FrameCache(folder, episodes, parser_fingerprint(model))
-    return cache.fill(lambda chosen: _parsed(model, episodes, chosen), process, processes)
 
+    @torch.no_grad()
+    def compute(chosen: range) -> NDArray[np.float16]:
+        clips = [episodes.frames(index) for index in chosen]
+        longest = max(map(len, clips))
+        # Parsing is causal: repeating the last frame of the shorter episodes changes nothing before it.
+        padded = np.stack([clip[np.minimum(np.arange(longest), len(clip) - 1)] for clip in clips])
+        # Initialisers that draw at random draw the same again for the same episodes.
+        generator = torch.Generator(model.device).manual_seed(chosen.start)
+        slots_BTKD = model.parser(to_frames(padded, model.device), generator=generator).slots_BTKD
+        found = slots_BTKD.half().cpu().numpy()
+        return np.concatenate([slots_TKD[: len(clip)] for slots_TKD, clip in zip(found, clips, strict=True)])
 
-@torch.no_grad()
-def _parsed(model: TextOCVP, episodes: Episodes, chosen: range) -> NDArray[np.float16]:
-    clips = [episodes.frames(index) for index in chosen]
-    longest = max(map(len, clips))
-    # Parsing is causal: repeating the last frame of the shorter episodes changes nothing before it.
-    padded = np.stack([clip[np.minimum(np.arange(longest), len(clip) - 1)] for clip in clips])
-    # Initialisers that draw at random draw the same again for the same episodes.
-    generator = torch.Generator(model.device).manual_seed(chosen.start)
-    slots_BTKD = model.parser(to_frames(padded, model.device), generator=generator).slots_BTKD
-    found = slots_BTKD.half().cpu().numpy()
-    return np.concatenate([slots_TKD[: len(clip)] for slots_TKD, clip in zip(found, clips, strict=True)])
-
-
-# ---- features of a frozen image encoder
+    return FrameCache(folder, episodes, parser_fingerprint(model)).fill(compute, process, processes)
 
 
 def cached_features(
@@ -209,11 +189,8 @@ def cached_features(
     processes: int = 1,
     *,
     device: torch.device | str = "cpu",
-    batch: int = 16,
 ) -> FrameCache:
-    """The features (L, F) float16 of every frame; those that are not in `folder` yet are computed.
-
-    At the published size they are 0.9 MB a frame. `batch` frames are encoded at once.
+    """The features (L, F) float16 of every frame, 0.9 MB each at the published size; shared out as `cached_slots`.
 
     Raises:
         WeightsError: if the encoder's weights are missing.
@@ -223,10 +200,9 @@ def cached_features(
     def compute(chosen: range) -> NDArray[np.float16]:
         frames_NHW3 = np.concatenate([episodes.frames(index) for index in chosen])
         found = [
-            encoder(to_frames(frames_NHW3[None, i : i + batch], device)[0]).half().cpu().numpy()
-            for i in range(0, len(frames_NHW3), batch)
+            encoder(to_frames(frames_NHW3[None, i : i + 16], device)[0]).half().cpu().numpy()
+            for i in range(0, len(frames_NHW3), 16)  # what fits the memory
         ]
         return np.concatenate(found)
 
-    cache = FrameCache(folder, episodes, encoder.load().fingerprint)
-    return cache.fill(compute, process, processes)
+    return FrameCache(folder, episodes, encoder.load().fingerprint).fill(compute, process, processes)

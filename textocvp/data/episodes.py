@@ -10,7 +10,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import h5py
@@ -20,8 +19,7 @@ from numpy.typing import NDArray
 FORMAT = "textocvp-episodes"
 FORMAT_VERSIONS = (1, 2)
 
-# What the labels of a segmentation meant before files said so themselves.
-BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
+ROBOT, FIRST_OBJECT = 1, 2  # labels in segmentations of version 1
 
 
 class EpisodeObject(NamedTuple):
@@ -34,7 +32,7 @@ class EpisodeObject(NamedTuple):
 
 
 class Question(NamedTuple):
-    """A sentence that a scene allows, and the ids of the object that should move and of that at which it should end."""
+    """A sentence that a scene allows, the id of the object that should move, and of that at which it should end."""
 
     text: str
     moves: int
@@ -89,7 +87,7 @@ class Episodes(ABC):
 
     @abstractmethod
     def __init__(self, path: str | os.PathLike[str], first: int | None = None) -> None:
-        """Open what is at `path`; with `first`, as if there were only the first so many episodes."""
+        """Open what is at `path`; with `first`, only the first so many episodes."""
 
     @classmethod
     @abstractmethod
@@ -111,7 +109,7 @@ class Episodes(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """A hash of what the episodes are, by which caches know them: of sentences, lengths and some first frames."""
+        """A hash by which caches know these episodes: of sentences, lengths and some first frames."""
         digest = hashlib.sha256("\n".join(self.instructions).encode())
         digest.update(np.ascontiguousarray(self.lengths, np.int64).tobytes())
         some = self.starts[:: max(1, len(self) // 256)]  # all would take minutes in a large file
@@ -134,19 +132,18 @@ class Episodes(ABC):
         """Where random clips of `length` frames begin (count,); every clip of the episodes is equally likely.
 
         Raises:
-            ValueError: when no episode is that long.
+            ValueError: when no episode is that long, or `count` or `length` is below 1.
         """
         if count < 1 or length < 1:
             raise ValueError(f"count and length must be at least 1, not {count} and {length}")
-        # An episode of T frames has T - length + 1 clips.
-        ends = np.cumsum(np.maximum(self.lengths - length + 1, 0))
+        clips = np.maximum(self.lengths - length + 1, 0)  # of each episode
+        ends = np.cumsum(clips)
         if len(self) == 0 or ends[-1] == 0:
             longest = int(self.lengths.max(initial=0))
             raise ValueError(f"no episode has {length} frames; the longest of {self.path} has {longest}")
         picks = rng.integers(ends[-1], size=count)
         episodes = np.searchsorted(ends, picks, side="right")
-        offsets = picks - (ends[episodes] - np.maximum(self.lengths[episodes] - length + 1, 0))
-        return self.starts[episodes] + offsets
+        return self.starts[episodes] + picks - (ends - clips)[episodes]
 
     def close(self) -> None:
         """Give back what is held open. A later read opens it again."""
@@ -159,23 +156,15 @@ class Episodes(ABC):
     def __enter__(self) -> Episodes:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
 class EpisodeFile(Episodes):
-    """One HDF5 file of format version 1 or 2.
-
-    Only frames, starts, lengths and instructions must be in it; masks, objects, questions, seeds and success may.
-
-    Args:
-        path: the file.
-        first: use only the first so many episodes, as if the file held no others.
+    """One HDF5 file of format version 1 or 2 (docs/data.md); its first so many episodes, or all.
 
     Attributes:
-        seeds: (E,) of the scenes, disjoint between splits; None where there are none.
+        seeds: (E,) of the scenes; None where there are none.
         success: (E,) whether the instructions were carried out; None where that was not judged.
         split: name of the split.
 
@@ -194,29 +183,29 @@ class EpisodeFile(Episodes):
             raise FileNotFoundError(
                 f"there is no episode file {self.path}; collect one with: python -m envs.collect --out {self.path}"
             )
+        kept = slice(first)
         try:
             file = self._open()
             self._version = self._check_format(file)
-            index, kept = file["episode"], slice(first)
+            index = file["episode"]
             self.lengths: NDArray[np.int64] = index["length"][:]
             self.instructions: tuple[str, ...] = tuple(index["instruction"].asstr()[kept])
             self.seeds: NDArray[np.int64] | None = index["seed"][kept] if "seed" in index else None
             self.success: NDArray[np.bool_] | None = index["success"][kept] if "success" in index else None
             self.image_size = int(file["frames"].shape[1])
             self.split = str(file.attrs.get("split", ""))
-            total, consecutive = file["frames"].shape[0], np.array_equal(index["start"][:], self.starts)
+            total = file["frames"].shape[0]
+            if total != self.lengths.sum() or not np.array_equal(index["start"][:], self.starts):
+                raise ValueError(
+                    f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}, which must "
+                    "stand one episode after another"
+                )
         except (OSError, KeyError) as error:
             self.close()
             raise ValueError(f"{self.path} is not an episode file, or is damaged: {error}") from error
         except ValueError:
             self.close()
             raise
-        if total != int(self.lengths.sum()) or not consecutive:
-            self.close()
-            raise ValueError(
-                f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}, which must stand "
-                "one episode after another"
-            )
         self.lengths = self.lengths[kept]
 
     @classmethod
@@ -232,11 +221,7 @@ class EpisodeFile(Episodes):
         return (self.episode(index) for index in range(len(self)))
 
     def episode(self, index: int) -> Episode:
-        """Everything of episode number ``index``; negative numbers count from the end.
-
-        Raises:
-            IndexError: when there is no such episode.
-        """
+        """Everything of an episode; negative numbers count from the end. An IndexError when there is none."""
         number = self._number(index)
         return Episode(
             frames=self.frames(number),
@@ -247,11 +232,7 @@ class EpisodeFile(Episodes):
         )
 
     def frames(self, index: int) -> NDArray[np.uint8]:
-        """All frames (T, H, W, 3) of an episode.
-
-        Raises:
-            IndexError: when there is no such episode.
-        """
+        """All frames (T, H, W, 3) of an episode; an IndexError when there is none."""
         return self._open()["frames"][self._rows(index)]
 
     def clips(self, starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
@@ -263,32 +244,23 @@ class EpisodeFile(Episodes):
         return clips
 
     def truth(self, index: int) -> Truth | None:
-        """Masks, objects and questions, as far as the file has them; None where it has neither.
-
-        Raises:
-            IndexError: when there is no such episode.
-        """
+        """Masks, objects and questions, as far as the file has them; None without masks and objects."""
         number, file = self._number(index), self._open()
         masks = file["segmentation"][self._rows(number)] if "segmentation" in file else None
         items = self._json("objects", number)
         if masks is None and not items:
             return None
+        robot: int | None = ROBOT
+        questions: tuple[Question, ...] = ()
         if self._version == 1:
-            objects = tuple(
-                EpisodeObject(id, FIRST_OBJECT + id, item["kind"], item["color"])
-                for id, item in enumerate(items)
-            )
-            robot: int | None = ROBOT
-            questions: tuple[Question, ...] = ()
-            if "target" in file["episode"]:
-                moves, ends_at = file["episode/target"][number].tolist()
-                questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
-        else:
-            objects = tuple(
-                EpisodeObject(item["id"], item["label"], item["kind"], item["color"]) for item in items
-            )
+            items = [{"id": id, "label": FIRST_OBJECT + id, **item} for id, item in enumerate(items)]
+        objects = tuple(EpisodeObject(*(item[name] for name in EpisodeObject._fields)) for item in items)
+        if self._version > 1:
             robot = json.loads(file.attrs.get("labels", "{}")).get("robot")
             questions = tuple(Question(**item) for item in self._json("questions", number))
+        elif "target" in file["episode"]:
+            moves, ends_at = file["episode/target"][number].tolist()
+            questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
         return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions)
 
     @property
@@ -306,7 +278,7 @@ class EpisodeFile(Episodes):
         """A file attribute, such as `camera_intrinsics` (3, 3), `camera_extrinsics` (4, 4) or `config`.
 
         Raises:
-            KeyError: for an attribute the file does not have; the message lists those it has.
+            KeyError: if the file has no such attribute; the message lists those it has.
         """
         attributes = self._open().attrs
         if name not in attributes:
@@ -314,7 +286,6 @@ class EpisodeFile(Episodes):
         return attributes[name]
 
     def close(self) -> None:
-        """Close the file. A later read opens it again."""
         if self._file is not None and self._process == os.getpid():
             self._file.close()
         self._file = None
@@ -359,10 +330,9 @@ class EpisodeFile(Episodes):
 def swapped_questions(
     instruction: str, objects: tuple[EpisodeObject, ...], moves: int, ends_at: int
 ) -> tuple[Question, ...]:
-    """The sentences that a scene allows, from the one that was played: each object named as its kind is named there.
+    """The sentences that a scene allows, from the one that was played, for files of version 1, which store none.
 
-    Empty where the sentence does not name the two objects by colour and kind. Files of format version 1 store no
-    questions.
+    Empty where the sentence does not name its two objects by colour and kind.
     """
     first, second = (next(item for item in objects if item.id == id) for id in (moves, ends_at))
     names = [f"{item.color} {item.kind}" for item in (first, second)]

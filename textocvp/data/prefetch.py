@@ -13,16 +13,13 @@ Batch = TypeVar("Batch")
 
 
 class _Steps(Dataset):
-    """The batches of some steps, for a DataLoader."""
+    """The batch of any step, for a DataLoader."""
 
-    def __init__(self, read: Callable[[int], Any], steps: range) -> None:
-        self.read, self.steps = read, steps
+    def __init__(self, read: Callable[[int], Any]) -> None:
+        self.read = read
 
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def __getitem__(self, index: int) -> Any:
-        return self.read(self.steps[index])
+    def __getitem__(self, step: int) -> Any:
+        return self.read(step)
 
 
 def _outlive_the_signal(worker: int) -> None:
@@ -38,13 +35,13 @@ def prefetch(read: Callable[[int], Batch], steps: range, workers: int) -> Iterab
     """The batches of these steps, in their order, read by `workers` processes beside this one (0: by this one).
 
     Args:
-        read: makes the batch of a step, as a function of its number alone: then workers change nothing but the speed.
-            Tensors in a batch travel through shared memory.
+        read: makes the batch of a step, as a function of its number alone: then workers change only the speed.
     """
     if workers == 0:
         return map(read, steps)
     return DataLoader(
-        _Steps(read, steps),
+        _Steps(read),
+        sampler=steps,
         batch_size=None,
         collate_fn=_as_read,
         num_workers=workers,

@@ -1,10 +1,9 @@
 """Batches of whole episodes in slot space, and the recolouring that teaches what colour words mean.
 
-Recolouring: the three colour channels of a scene's slots and of its sentence's lexicon colours are put into
-one random order. A parser whose content ignores hue (see `textocvp.parsers.placed`) would have found just these slots
-in the recoloured video, so a few caption colours become many, and the rule "the slot whose colour is the
-word's" is what they share. Where words carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red"
-would stay "red" while the red object turns blue.
+Recolouring puts the colour channels of a scene's slots and of its sentence's lexicon colours into one random order.
+A parser whose content ignores hue (`textocvp.parsers.placed`) would have found just these slots in the recoloured
+video. So a few caption colours become many, and what they share is "the slot whose colour is the word's". Where words
+carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red" would stay "red" while it turns blue.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ class SlotBatch:
     """Episodes of one length.
 
     Attributes:
-        slots_BTKD: true slots, float32; unused slots that no episode of the batch needs are left out.
+        slots_BTKD: true slots, float32; slots that no episode of the batch uses are left out.
         words: the sentences, looked up.
         episodes_B: numbers of the episodes.
-        channels_B3: the order of the colour channels that was drawn, for whoever recolours frames alike.
+        channels_B3: the order in which their colour channels are.
     """
 
     slots_BTKD: Tensor
@@ -47,8 +46,7 @@ class SlotBatches:
         layout: what their numbers mean.
         text: looks the sentences up; its weights are not used.
         frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
-        recolor: permute the colour channels. Has no effect where slots have no explicit colour, or the words of `text`
-            no RGB.
+        recolor: permute the colour channels, where slots have explicit colour and the words of `text` have RGB.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
         place_jitter: standard deviation of the noise of `noisy`, in -1..1.
     """
@@ -60,14 +58,12 @@ class SlotBatches:
         text: TextEncoder,
         frames: int,
         *,
-        recolor: bool,
-        color_jitter: float,
-        place_jitter: float,
+        recolor: bool = True,
+        color_jitter: float = 0.03,
+        place_jitter: float = 0.01,
     ) -> None:
-        words_follow = layout.explicit and text.words_have_rgb
-        self.layout, self.recolor = layout, recolor and words_follow
+        self.layout, self.recolor = layout, recolor and layout.explicit and text.words_have_rgb
         self.color_jitter, self.place_jitter = color_jitter, place_jitter
-        self.frames = frames
         self._slots_ETKD = padded(cache, frames)
         self._words = text.lookup(cache.instructions).to("cpu")
 
@@ -91,17 +87,18 @@ class SlotBatches:
         channels_B3 = torch.arange(3).expand(size, 3)
         if not self.layout.explicit:
             return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
-        slots_BTKD = _used(slots_BTKD)
+        # The used slots of every episode first, cut to the most that any episode of the batch has.
+        used_BK = slots_BTKD[..., -1].amax(dim=1) >= 0.5
+        order_BK = used_BK.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+        order_BK = order_BK[:, : int(used_BK.sum(dim=1).max())]
+        slots_BTKD = slots_BTKD.take_along_dim(order_BK[:, None, :, None], dim=2)
         state = SlotState.split(slots_BTKD, self.layout)
         if self.recolor:
             channels_B3 = torch.from_numpy(rng.permuted(np.tile(np.arange(3), (size, 1)), axis=1))
             words = words.permute_channels(channels_B3)
         # Colour and presence are carried through a rollout: what they are in the first frame they are in all.
-        order = channels_B3[:, None, None].expand_as(state.color[:, :1])
-        color = state.color[:, :1].gather(-1, order)
-        rng.random(
-            (2, size, 3)
-        )  # not used any more; without it a seed would give other runs than it always did
+        color = state.color[:, :1].take_along_dim(channels_B3[:, None, None], dim=-1)
+        rng.random((2, size, 3))  # unused; without it a seed would give other runs than it always did
         color = (color + _noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
         presence = state.presence[:, :1].expand_as(state.presence)
         slots_BTKD = replace(state, color=color, presence=presence).join()
@@ -110,23 +107,13 @@ class SlotBatches:
         return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
 
     def noisy(self, rng: np.random.Generator, slots_BTKD: Tensor) -> Tensor:
-        """The same slots, each a little off its place: a teacher-forced predictor that has only seen exact
-        places does not know how to come back from its own small errors."""
+        """The same slots, each a little off its place."""
+        # A teacher-forced predictor that has only seen exact places cannot come back from its own small errors.
         if not self.layout.explicit or self.place_jitter == 0:
             return slots_BTKD
         state = SlotState.split(slots_BTKD, self.layout)
         noise = _noise(rng, state.position.shape, self.place_jitter).to(slots_BTKD.device)
         return replace(state, position=state.position + noise * state.is_thing).join()
-
-
-def _used(slots_BTKD: Tensor) -> Tensor:
-    """The slots with presence first in every episode, cut to the most that any episode of the batch has."""
-    used_BK = slots_BTKD[..., -1].amax(dim=1) >= 0.5
-    order_BK = used_BK.to(torch.int8).argsort(dim=1, descending=True, stable=True)
-    order_BK = order_BK[:, : int(used_BK.sum(dim=1).max())]
-    return slots_BTKD.gather(
-        2, order_BK[:, None, :, None].expand(-1, slots_BTKD.shape[1], -1, slots_BTKD.shape[3])
-    )
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Tensor:
@@ -145,4 +132,4 @@ def true_frames(
     clips = [episodes.frames(index) for index in episodes_B]
     chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]
     frames_BS3HW = to_frames(np.stack(chosen))
-    return frames_BS3HW.gather(2, channels_B3[:, None, :, None, None].expand_as(frames_BS3HW))
+    return frames_BS3HW.take_along_dim(channels_B3[:, None, :, None, None], dim=2)

@@ -1,7 +1,7 @@
 """From frames to slots: what every scene parser is.
 
-A `SceneParser` is an encoder, an initializer (first frame), a corrector (every frame) and a transition (between
-frames): slot attention for video (SAVi; TextOCVP section 3.1). Which parts those are is the subclass's business.
+The published ones have an encoder, an initializer (first frame), a corrector (every frame) and a transition (between
+frames), see SAVi and TextOCVP section 3.1.
 """
 
 from __future__ import annotations
@@ -21,18 +21,11 @@ from textocvp.slots import SlotLayout
 
 @dataclass(frozen=True)
 class ParserConfig:
-    """What every parser is built from; a subclass adds its own options and refuses values that make no sense.
+    """What every parser is built from; a subclass adds its own options and refuses values that make no sense."""
 
-    Attributes:
-        kind: name in `textocvp.parsers.PARSERS`.
-        image_size: side of the square frame in pixels.
-        num_slots: K, background included. Can be raised when the model is used.
-        layout: what the numbers of a slot mean.
-    """
-
-    kind: str
-    image_size: int = 64
-    num_slots: int = 12
+    kind: str  # a name in `textocvp.parsers.PARSERS`
+    image_size: int = 64  # side of the square frame in pixels
+    num_slots: int = 12  # K, background included; can be raised when the model is used
     layout: SlotLayout = SlotLayout(content=64)
 
     @property
@@ -42,9 +35,8 @@ class ParserConfig:
 
     def _check_layout(self, explicit: bool) -> None:
         if self.layout.explicit != explicit:
-            raise ValueError(
-                f"parser.kind {self.kind!r} needs parser.layout.explicit = {str(explicit).lower()}"
-            )
+            wanted = str(explicit).lower()
+            raise ValueError(f"parser.kind {self.kind!r} needs parser.layout.explicit = {wanted}")
 
     @staticmethod
     def _check_heads(width: int, heads: int) -> None:
@@ -56,32 +48,18 @@ class ParserConfig:
 
 @dataclass
 class Parsed:
-    """What a parser found.
+    """What a parser found."""
 
-    Attributes:
-        slots_BTKD: the corrected slots of every frame.
-        attention_BTKHW: what each slot's attention covers, at feature resolution; sums to 1 over the slots.
-        expected_BTKD: the slots that the transition expected for frames 1 to T-1 before it saw them; None
-            for a parser whose slots have no place that could be expected.
-        features_BTLF: what a frozen encoder saw, of L patches row by row: what reconstructed features are compared
-            with; None for a parser that learns its encoder.
-    """
-
-    slots_BTKD: Tensor
-    attention_BTKHW: Tensor
+    slots_BTKD: Tensor  # the corrected slots of every frame
+    attention_BTKHW: Tensor  # what each slot covers, at feature resolution; sums to 1 over the slots
+    # What the transition expected of frames 1 to T-1 before it saw them; None if slots have no place to expect.
     expected_BTKD: Tensor | None = None
+    # What a frozen encoder saw, of L patches row by row: reconstructed features are compared with it.
     features_BTLF: Tensor | None = None
 
 
 class SceneParser(nn.Module):
-    """Frames to slots. Subclasses set `Config` and write `forward`.
-
-    Attributes:
-        Config: the class of its configuration.
-        config: what it was built from.
-        layout: what the numbers of one slot mean.
-        dino: its frozen image encoder, which is no part of the checkpoint; None if it learns its encoder.
-    """
+    """Frames to slots. Subclasses set `Config` and write `forward`."""
 
     Config: ClassVar[type[ParserConfig]]
     config: ParserConfig
@@ -89,7 +67,7 @@ class SceneParser(nn.Module):
     def __init__(self, config: ParserConfig) -> None:
         super().__init__()
         self.config, self.layout = config, config.layout
-        self.dino: DinoEncoder | None = None
+        self.dino: DinoEncoder | None = None  # a frozen image encoder, which is no part of the checkpoint
 
     @abstractmethod
     def forward(
@@ -104,9 +82,8 @@ class SceneParser(nn.Module):
         Args:
             frames_BT3HW: frames in -1..1, of the size the parser was built for.
             num_slots: how many slots to use, background included; the configured number by default.
-            generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by
-                default. One for each clip, on any device: what is drawn for a clip then does not depend on
-                which others are parsed with it.
+            generator: where initial slots are drawn from, on the frames' device; PyTorch's own by default. Or one for
+                each clip, on any device: a clip's slots then do not depend on its neighbours.
         """
         raise NotImplementedError
 

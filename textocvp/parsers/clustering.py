@@ -1,9 +1,8 @@
 """Slots that start from clusters of colour and place, without labels and without learned weights.
 
-The published parser samples its first slots from one learned Gaussian; in the few hours that two CPU cores allow,
-such slots tile the image by region and bind to nothing. Starting from clusters (the idea of clustering-based slot
-initialisation, 2023) every object has a slot from the first step of training. Slots stay exchangeable and their
-number stays free at test time.
+The published parser samples its first slots from one learned Gaussian. In a few hours of two CPU cores such slots tile
+the image by region and bind to nothing. With clusters (the idea of clustering-based slot initialisation, 2023) every
+object has a slot from the first step of training. Slots stay exchangeable, and their number stays free at test time.
 """
 
 from __future__ import annotations
@@ -22,27 +21,17 @@ PLACE_WEIGHT = 0.7
 
 @dataclass
 class Clusters:
-    """Disjoint regions of a batch of images.
+    """Disjoint regions of a batch of images."""
 
-    Attributes:
-        masks: (B, K, H, W) float, one-hot over K. Region 0 is the background, the others are sorted by area.
-        presence: (B, K) 1 where the region has pixels, 0 where it is unused.
-    """
-
-    masks: Tensor
-    presence: Tensor
+    masks: Tensor  # (B, K, H, W) float, one-hot over K; region 0 is the background, the others are sorted by area
+    presence: Tensor  # (B, K) 1 where the region has pixels, 0 where it is unused
 
 
 def color_features(colors: Tensor) -> Tensor:
-    """Chroma and luminance, in which the shading of one object matters little.
+    """Features (..., 4) of RGB in -1..1, in which the shading of one object matters little.
 
-    Every permutation of the colour channels permutes the chroma and leaves all distances between features as they are.
-
-    Args:
-        colors: (..., 3) RGB in -1..1.
-
-    Returns:
-        (..., 4): twice the chroma `(rgb - L) / (L + .2)`, then the luminance L = mean(rgb) in 0..1.
+    Twice the chroma `(rgb - L) / (L + .2)`, then the luminance L = mean(rgb) in 0..1. A permutation of the colour
+    channels permutes the chroma and leaves all distances between features as they are.
     """
     rgb = (colors + 1) / 2
     luminance = rgb.mean(-1, keepdim=True)
@@ -58,46 +47,23 @@ def squared_distances(a: Tensor, b: Tensor) -> Tensor:
 
 
 class ClusterInitializer(nn.Module):
-    """Farthest-point seeds, a few k-means rounds, then touching clusters of one colour united.
+    """Farthest-point seeds, a few k-means rounds, then touching clusters of one colour united."""
 
-    Args:
-        seeds: how many clusters to start from, the background not counted; more where more slots are asked for.
-        rounds: k-means rounds.
-        background_distance: squared feature distance from the image's median colour above which a pixel can seed.
-        same_chroma, same_luminance: touching clusters closer than this in chroma (sum over channels) and luminance
-            are one thing.
-        min_pixels: smaller regions go back to the background.
-    """
-
-    def __init__(
-        self,
-        seeds: int = 16,
-        rounds: int = 4,
-        background_distance: float = 0.03,
-        same_chroma: float = 0.1,
-        same_luminance: float = 0.15,
-        min_pixels: int = 4,
-    ) -> None:
-        super().__init__()
-        self.seeds = seeds
-        self.rounds = rounds
-        self.background_distance = background_distance
-        self.same_chroma = same_chroma
-        self.same_luminance = same_luminance
-        self.min_pixels = min_pixels
+    seeds = 16  # clusters to start from, the background not counted; more where more slots are asked for
+    rounds = 4  # of k-means
+    background_distance = 0.03  # squared feature distance from the median colour above which a pixel can seed
+    # Touching clusters that are closer than this in chroma (sum over channels) and luminance are one thing.
+    same_chroma, same_luminance = 0.1, 0.15
+    min_pixels = 4  # smaller regions go back to the background
 
     @torch.no_grad()
     def forward(self, frames: Tensor, num_slots: int) -> Clusters:
-        """Divide each image into a background and at most `num_slots - 1` regions.
-
-        Args:
-            frames: (B, 3, H, W) in -1..1.
-            num_slots: K, background included, at least 2.
+        """Divide frames (B, 3, H, W) in -1..1 into a background and at most `num_slots - 1` regions.
 
         Raises:
             ValueError: if `num_slots` is below 2.
         """
-        check_slots(num_slots)
+        _check_slots(num_slots)
         B, _, H, W = frames.shape
         colors_BNC = color_features(frames.flatten(2).transpose(1, 2).float())
         place_BNC = (PLACE_WEIGHT * pixel_grid(H, W, device=frames.device).flatten(0, 1)).expand(B, -1, -1)
@@ -121,9 +87,7 @@ class ClusterInitializer(nn.Module):
         for _ in range(seeds):
             # Blurred, so that a seed lies inside a region and not on an odd pixel of its edge.
             smooth_BN = F.avg_pool2d(nearest_BN.view(B, 1, H, W), 3, 1, 1, count_include_pad=False).flatten(1)
-            smooth_BN = torch.where(
-                nearest_BN > self.background_distance, smooth_BN, torch.zeros_like(smooth_BN)
-            )
+            smooth_BN = smooth_BN.masked_fill(nearest_BN <= self.background_distance, 0.0)
             value_B1, index_B1 = smooth_BN.max(dim=1, keepdim=True)
             center_B1C = points_BNC.gather(1, index_B1[..., None].expand(-1, -1, C))
             centers.append(center_B1C)
@@ -181,29 +145,16 @@ class FeatureClusters(ClusterInitializer):
     Features are compared by their direction (each is normalised to mean 0 and length 1), and their distances from the
     image's median feature, the background, are scaled so that the largest is 1. Clusters are not united: what makes two
     of them one thing is known for colours only.
-
-    Args:
-        rounds: k-means rounds.
-        background_distance: share of the largest squared distance from the background above which a location can seed.
-        place_weight: length of the image's half side, in units of the largest distance.
     """
 
-    def __init__(self, rounds: int = 4, background_distance: float = 0.3, place_weight: float = 0.3) -> None:
-        super().__init__(rounds=rounds, background_distance=background_distance, min_pixels=1)
-        self.place_weight = place_weight
+    background_distance = 0.3  # share of the largest squared distance above which a location can seed
+    min_pixels = 1
+    place_weight = 0.3  # length of the image's half side, in units of the largest distance
 
     @torch.no_grad()
     def forward(self, features: Tensor, num_slots: int) -> Clusters:
-        """Divide each image's locations into a background and at most `num_slots - 1` regions.
-
-        Args:
-            features: (B, F, h, w).
-            num_slots: K, background included, at least 2.
-
-        Raises:
-            ValueError: if `num_slots` is below 2.
-        """
-        check_slots(num_slots)
+        """Divide the locations of features (B, F, h, w); errors as the base class."""
+        _check_slots(num_slots)
         B, C, H, W = features.shape
         points_BNC = F.layer_norm(features.flatten(2).transpose(1, 2).float(), (C,)) * C**-0.5
         points_BNC = points_BNC - points_BNC.median(dim=1, keepdim=True).values
@@ -211,16 +162,14 @@ class FeatureClusters(ClusterInitializer):
         largest_B1 = to_background_BN.amax(dim=1, keepdim=True).clamp_min(1e-6)
         to_background_BN = to_background_BN / largest_B1
         place_N2 = self.place_weight * pixel_grid(H, W, device=features.device).flatten(0, 1)
-        points_BNC = torch.cat(
-            [points_BNC / largest_B1[..., None].sqrt(), place_N2.expand(B, -1, -1)], dim=-1
-        )
+        points_BNC = points_BNC / largest_B1[..., None].sqrt()
+        points_BNC = torch.cat([points_BNC, place_N2.expand(B, -1, -1)], dim=-1)
         # As many as there are slots for them: none is united with another, and none should be left over.
         centers_BSC, used_BS = self._seed(points_BNC, to_background_BN, H, W, num_slots - 1)
         onehot_BNS = self._k_means(points_BNC, to_background_BN, centers_BSC, used_BS)
         return self._largest(onehot_BNS.transpose(1, 2), num_slots, H, W)
 
 
-def check_slots(num_slots: int) -> None:
-    """Raise a ValueError if there are too few slots for a background and a region."""
+def _check_slots(num_slots: int) -> None:
     if num_slots < 2:
         raise ValueError(f"num_slots must be at least 2 (a background and one region), not {num_slots}")

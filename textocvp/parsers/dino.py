@@ -1,8 +1,8 @@
 """The frozen image encoder of the published CLIPort models: DINOv2 (Oquab et al. 2023), through transformers.
 
 A checkpoint says where its weights were found (`parser.encoder_weights`, of MAGE-DINO `vqvae.encoder_weights`) and
-which they are (`encoder_fingerprint`). They are read when the first frame is encoded, so that a model can be built,
-counted and trained on cached features, slots or codes without them.
+which they are (`encoder_fingerprint`). They are read when the first frame is encoded: a model can be built, counted and
+trained on cached features, slots or codes without them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from transformers import Dinov2Config, Dinov2Model
 
 from textocvp.pretrained import PretrainedFiles, WeightsError, read_model
 
@@ -28,26 +27,31 @@ def normalized(frames_N3HW: Tensor) -> Tensor:
     return ((frames_N3HW + 1) / 2 - mean) / std
 
 
+def cells_along(side: int, patch: int, part: str = "parser") -> int:
+    """Patches along a side of a frame; `part` of the configuration names the field in the message.
+
+    Raises:
+        ValueError: if patches do not divide it.
+    """
+    if side % patch:
+        raise ValueError(f"{part}.image_size: patches of {patch} pixels do not divide {side} pixels evenly")
+    return side // patch
+
+
 class DinoEncoder(nn.Module):
     """Frames to the features of their patches, without gradient and always in evaluation mode.
 
-    The backbone is no submodule on purpose: so its weights are in no checkpoint and no optimiser, and `train()` cannot
-    switch its dropout on.
-
     Args:
-        weights: a folder with `config.json` and `model.safetensors`, or the id of a repository on the Hugging Face hub.
+        weights: a folder with `config.json` and `model.safetensors`, or a hub id; empty for facebook/dinov2-base.
         dim: width of its features.
         patch: side of its patches in pixels.
-        fingerprint: of the weights that it must be; empty for any.
+        fingerprint: of the weights that it must be; empty for any, until they are read.
         part: of the configuration, for messages that name a field.
-
-    Attributes:
-        fingerprint: of the weights; empty as long as none are known.
     """
 
     def __init__(
         self,
-        weights: str | Path = DINO_HUB_ID,
+        weights: str | Path = "",
         *,
         dim: int = 768,
         patch: int = 14,
@@ -55,21 +59,14 @@ class DinoEncoder(nn.Module):
         part: str = "parser",
     ) -> None:
         super().__init__()
-        self.weights, self.dim, self.patch, self.fingerprint = str(weights), dim, patch, fingerprint
-        self.part = part
-        self._backbone: list[nn.Module] = []  # a list, so that it is not registered
+        self.weights, self.dim, self.patch = str(weights), dim, patch
+        self.fingerprint, self.part = fingerprint, part
+        # In a list it is no submodule: in no checkpoint and no optimiser, and `train()` cannot switch its dropout on.
+        self._backbone: list[nn.Module] = []
 
     def cells(self, image_size: int) -> int:
-        """Patches along a side of a square frame.
-
-        Raises:
-            ValueError: if patches do not divide it.
-        """
-        if image_size % self.patch:
-            raise ValueError(
-                f"{self.part}.image_size: patches of {self.patch} pixels do not divide {image_size} pixels evenly"
-            )
-        return image_size // self.patch
+        """Patches along a side of a square frame, see `cells_along`."""
+        return cells_along(image_size, self.patch, self.part)
 
     def load(self) -> DinoEncoder:
         """Read the weights, if that has not been done; returns itself.
@@ -78,6 +75,8 @@ class DinoEncoder(nn.Module):
             WeightsError: if they are missing or damaged, of another size, or not those of `fingerprint`.
         """
         if not self._backbone:
+            from transformers import Dinov2Config, Dinov2Model  # takes seconds, and only this needs them
+
             settings = (f"{self.part}.encoder_weights", f"{self.part}.encoder_fingerprint")
             files = PretrainedFiles("the image encoder", *settings, DINO_HUB_ID)
             folder = files.folder(self.weights)
@@ -88,9 +87,8 @@ class DinoEncoder(nn.Module):
                 ("encoder_patch", self.patch, architecture.patch_size),
             ):
                 if wanted != has:
-                    raise WeightsError(
-                        f"{self.part}.{field} is {wanted}, that of the weights in {folder} is {has}"
-                    )
+                    where = f"that of the weights in {folder}"
+                    raise WeightsError(f"{self.part}.{field} is {wanted}, {where} is {has}")
             self._backbone.append(read_model(Dinov2Model, folder).eval().requires_grad_(False))
             self.fingerprint = found
         return self

@@ -1,7 +1,6 @@
 """The parser of Non-OC, the baseline without objects: a frame is one slot (TextOCVP, TMLR 2026, section 4).
 
-A block of convolutions and an average pooling make one vector of each frame, alone. Everything after it, the predictor
-above all, is the same as for many slots.
+Convolutions and an average pooling make one vector of each frame. All that follows is the same as for many slots.
 """
 
 from __future__ import annotations
@@ -21,18 +20,13 @@ from textocvp.slots import SlotLayout
 
 @dataclass(frozen=True)
 class HolisticConfig(ParserConfig):
-    """Options of `HolisticParser`.
-
-    Attributes:
-        encoder_channels: width of the first convolution.
-        pool_cells: cells along a side of the frame whose features are averaged: 1 as published.
-    """
+    """Options of `HolisticParser`."""
 
     kind: Literal["holistic"] = "holistic"
     num_slots: int = 1
     layout: SlotLayout = SlotLayout(content=256, explicit=False)
-    encoder_channels: int = 32
-    pool_cells: int = 1
+    encoder_channels: int = 32  # width of the first convolution
+    pool_cells: int = 1  # cells along a side of the frame whose features are averaged; published: 1
 
     def __post_init__(self) -> None:
         self._check_layout(explicit=False)  # one slot has no one place
@@ -83,9 +77,7 @@ class HolisticParser(SceneParser):
             ValueError: if more than one slot is asked for.
         """
         if num_slots not in (None, 1):
-            raise ValueError(
-                f"this model sees a frame as one slot (parser.kind 'holistic'); it cannot use {num_slots}"
-            )
+            raise ValueError(f"parser.kind 'holistic' sees a frame as one slot; it cannot use {num_slots}")
         B, T = frames_BT3HW.shape[:2]
         features_NChw = self.mix(self.position(self.convolutions(frames_BT3HW.flatten(0, 1))))
         pooled_NCpp = F.adaptive_avg_pool2d(features_NChw, self.config.pool_cells)

@@ -27,20 +27,13 @@ from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
 
 @dataclass(frozen=True)
 class PlacedConfig(ParserConfig):
-    """Options of `PlacedParser`.
-
-    Attributes:
-        crop_cells: side in cells of the canonical picture in which the corrector reads a slot.
-        crop_extent: how many standard deviations that picture reaches to each side.
-        hidden: width of the corrector's fully connected layers.
-        transition_heads, transition_hidden: the transformer block between frames.
-    """
+    """Options of `PlacedParser`."""
 
     kind: Literal["placed"] = "placed"
-    crop_cells: int = 24
-    crop_extent: float = 2.6
-    hidden: int = 256
-    transition_heads: int = 4
+    crop_cells: int = 24  # side in cells of the canonical picture in which the corrector reads a slot
+    crop_extent: float = 2.6  # how many standard deviations that picture reaches to each side
+    hidden: int = 256  # width of the corrector's fully connected layers
+    transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128
 
     def __post_init__(self) -> None:
@@ -49,26 +42,14 @@ class PlacedConfig(ParserConfig):
 
 
 class PlaceAttention(nn.Module):
-    """Which slot each pixel belongs to, by colour and place.
+    """Which slot each pixel belongs to, by colour and place."""
 
-    Args:
-        color_weight: weight of a squared colour-feature distance in the logits.
-        background_distance: squared colour-feature distance beyond which a pixel belongs to no thing (it goes to the
-            background).
-        place_weight: weight of the place term, `log(1 + d^2)`, heavy-tailed so that a thing that moved is still found.
-        search_radius: how far a thing may move between frames without cost, added to three times its scale.
-    """
-
-    def __init__(
-        self,
-        color_weight: float = 240.0,
-        background_distance: float = 0.12,
-        place_weight: float = 12.0,
-        search_radius: float = 0.08,
-    ) -> None:
-        super().__init__()
-        self.color_weight, self.background_distance = color_weight, background_distance
-        self.place_weight, self.search_radius = place_weight, search_radius
+    color_weight = 240.0  # of a squared colour-feature distance in the logits
+    background_distance = 0.12  # squared colour-feature distance beyond which a pixel is background
+    # Of the place term log(1 + d^2): heavy-tailed, so that a thing that moved is still found.
+    place_weight = 12.0
+    # How far a thing may move between frames without cost, added to three times its scale.
+    search_radius = 0.08
 
     @torch.no_grad()
     def forward(self, frames: Tensor, state: SlotState) -> Tensor:
@@ -94,19 +75,14 @@ class PlaceAttention(nn.Module):
 
 
 class PlacedCorrector(nn.Module):
-    """Updates the slots from one frame: attention, explicit state from its moments, content through a GRU.
+    """Updates the slots from one frame: attention, explicit state from its moments, content through a GRU."""
 
-    Args:
-        config: sizes.
-        min_pixels: a slot that gets less than this is hidden; it keeps what it had.
-    """
+    min_pixels = 3.0  # a slot that gets less than this is hidden; it keeps what it had
 
-    def __init__(self, config: PlacedConfig, min_pixels: float = 3.0) -> None:
+    def __init__(self, config: PlacedConfig) -> None:
         super().__init__()
         content = config.layout.content
-        self.cells = config.crop_cells
-        self.extent = config.crop_extent
-        self.min_pixels = min_pixels
+        self.cells, self.extent = config.crop_cells, config.crop_extent
         self.attend = PlaceAttention()
         self.values = nn.Sequential(
             nn.Linear(2 * self.cells**2, config.hidden),
@@ -126,12 +102,8 @@ class PlacedCorrector(nn.Module):
     def forward(
         self, frames: Tensor, state: SlotState, attention: Tensor | None = None
     ) -> tuple[SlotState, Tensor]:
-        """The corrected slots and the attention (B, K, H, W) for frames (B, 3, H, W).
-
-        Args:
-            attention: use this attention instead of computing it (first frame: the clusters themselves).
-        """
-        if attention is None:
+        """The corrected slots and the attention (B, K, H, W) for frames (B, 3, H, W)."""
+        if attention is None:  # given on the first frame: the clusters themselves
             attention = self.attend(frames, state)
         seen = state.is_thing & (attention.sum((2, 3))[..., None] >= self.min_pixels)
         position, scale = moments(attention)
@@ -162,14 +134,8 @@ class PlacedTransition(nn.Module):
         content = config.layout.content
         width = 2 * content
         self.inputs = nn.Linear(content + 5, width)
-        self.block = nn.TransformerEncoderLayer(
-            width,
-            config.transition_heads,
-            config.transition_hidden,
-            dropout=0.0,
-            batch_first=True,
-            norm_first=True,
-        )
+        sizes = (width, config.transition_heads, config.transition_hidden)
+        self.block = nn.TransformerEncoderLayer(*sizes, dropout=0.0, batch_first=True, norm_first=True)
         self.outputs = nn.Linear(width, content + 4)
         nn.init.zeros_(self.outputs.weight)
         nn.init.zeros_(self.outputs.bias)
@@ -209,7 +175,7 @@ class PlacedParser(SceneParser):
         num_slots: int | None = None,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> Parsed:
-        """Parse clips; see `SceneParser.forward`. Nothing is drawn at random here: `generator` changes nothing."""
+        """See `SceneParser.forward`. Nothing is drawn at random: `generator` changes nothing."""
         state, attention = self.first(frames_BT3HW[:, 0], num_slots or self.config.num_slots)
         slots, attentions, expectations = [state.join()], [attention], []
         for t in range(1, frames_BT3HW.shape[1]):

@@ -17,79 +17,53 @@ from torch import Tensor, nn
 from textocvp.layers import PositionCode, init_relu_
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
-from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
+from textocvp.parsers.dino import DinoEncoder, cells_along
 from textocvp.slots import SlotLayout
 
 
 @dataclass(frozen=True)
 class SaviConfig(ParserConfig):
-    """Options of `SaviParser`: encoder -> initializer -> corrector -> transition.
-
-    Attributes:
-        initializer: `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour
-            and place, or of the frozen encoder's features.
-        encoder: `conv` (learned) or `dinov2` (frozen).
-        encoder_channels: width of the convolutional encoder.
-        encoder_stride: stride of its first convolution.
-        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
-        encoder_dim, encoder_patch: width of its features and side of its patches in pixels.
-        encoder_fingerprint: of its weights, set when a model that has used them is saved; others are then an error.
-        iterations_first: corrector iterations on the first frame; later frames take one.
-        transition_heads, transition_hidden: the transformer block between frames.
-    """
+    """Options of `SaviParser`: encoder -> initializer -> corrector -> transition."""
 
     kind: Literal["savi"] = "savi"
     layout: SlotLayout = SlotLayout(content=64, explicit=False)
+    # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, or
+    # of the frozen encoder's features.
     initializer: Literal["gaussian", "cluster"] = "cluster"
-    encoder: Literal["conv", "dinov2"] = "conv"
-    encoder_channels: int = 32
-    encoder_stride: int = 1
+    encoder: Literal["conv", "dinov2"] = "conv"  # learned, or frozen
+    encoder_channels: int = 32  # width of the convolutional encoder
+    encoder_stride: int = 1  # of its first convolution
+    # Folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
     encoder_weights: str = ""
-    encoder_dim: int = 768
-    encoder_patch: int = 14
+    encoder_dim: int = 768  # width of its features
+    encoder_patch: int = 14  # side of its patches in pixels
+    # Of its weights, set when a model that has used them is saved; others are an error.
     encoder_fingerprint: str = ""
-    iterations_first: int = 1
-    transition_heads: int = 4
+    iterations_first: int = 1  # of the corrector on the first frame; later frames take one
+    transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128
 
     def __post_init__(self) -> None:
         self._check_layout(explicit=False)
         self._check_heads(self.layout.dim, self.transition_heads)
-        if self.encoder == "dinov2" and self.image_size % self.encoder_patch:
-            raise ValueError(
-                f"parser.image_size: patches of {self.encoder_patch} pixels do not divide {self.image_size} pixels "
-                "evenly"
-            )
+        _ = self.features  # patches must divide the frame
 
     @property
     def features(self) -> tuple[int, int] | None:
         if self.encoder != "dinov2":
             return None
-        return self.image_size // self.encoder_patch, self.encoder_dim
+        return cells_along(self.image_size, self.encoder_patch), self.encoder_dim
 
 
 class ConvEncoder(nn.Module):
-    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code,
-    location-wise MLP.
-
-    Args:
-        channels: width of the convolutions (32 in the paper).
-        stride: stride of the first one (1 in the paper: features at every pixel).
-        out_dim: D, the slots' width.
-    """
+    """Frames (N, 3, H, W) in -1..1 to features (N, D, h, w): four 5x5 convolutions, position code, local MLP."""
 
     def __init__(self, channels: int, stride: int, out_dim: int) -> None:
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(3, channels, 5, stride=stride, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-        )
+        blocks = [nn.Conv2d(3, channels, 5, stride=stride, padding=2), nn.ReLU()]
+        for _ in range(3):
+            blocks += [nn.Conv2d(channels, channels, 5, padding=2), nn.ReLU()]
+        self.convolutions = nn.Sequential(*blocks)
         init_relu_(self.convolutions)  # else the picture shrinks until the position code drowns it
         self.position = PositionCode(channels)
         self.mlp = nn.Sequential(
@@ -102,10 +76,7 @@ class ConvEncoder(nn.Module):
 
 
 class FeatureProjection(nn.Module):
-    """Features of a frozen encoder (N, F, h, w) to those that slots compete for (N, D, h, w): a location-wise MLP.
-
-    They know their places already, so there is no position code.
-    """
+    """Features of a frozen encoder (N, F, h, w), which know their places, to those for the slots (N, D, h, w)."""
 
     def __init__(self, feature_dim: int, out_dim: int) -> None:
         super().__init__()
@@ -120,11 +91,62 @@ class FeatureProjection(nn.Module):
         return self.mlp(features_NFhw.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
+class GaussianInitializer(nn.Module):
+    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test time."""
+
+    def __init__(self, slot_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
+
+    def forward(
+        self,
+        batch: int,
+        num_slots: int,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
+        """(batch, num_slots, D) slots."""
+        size, mean = (num_slots, len(self.mean)), self.mean
+        if isinstance(generator, Sequence):
+            drawn = [torch.randn(size, generator=one, device=one.device) for one in generator]
+            noise_BKD = torch.stack(drawn).to(mean)
+        else:
+            noise_BKD = torch.randn(batch, *size, generator=generator, device=mean.device, dtype=mean.dtype)
+        return self.mean + self.log_deviation.exp() * noise_BKD
+
+
+class ClusterSlots(nn.Module):
+    """First slots from clusters: the mean feature of each cluster, through a small MLP."""
+
+    def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
+        super().__init__()
+        self.clusters = clusters
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
+        )
+        # What a cluster without pixels gives: a slot like any other, since it has no presence that could be 0.
+        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
+
+    def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
+        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers.
+
+        Args:
+            seen_BCHW: what is divided into clusters: frames, or the features of a frozen encoder.
+            features_BDhw: whose means the slots are made of.
+        """
+        found = self.clusters(seen_BCHW, num_slots)
+        h, w = features_BDhw.shape[-2:]
+        shares_BKL = F.adaptive_avg_pool2d(found.masks, (h, w)).flatten(2)
+        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
+        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
+        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL
+
+
 class SlotAttention(nn.Module):
     """The corrector: slots compete for locations, then each is updated with the mean of what it won.
 
-    Weights are a softmax over the slots of q(slots) k(features)^T / sqrt(D), renormalised over the
-    locations; the update is a GRU and a residual MLP (Locatello et al. 2020; TextOCVP equations 1 and 2).
+    Weights are a softmax over the slots, renormalised over the locations; the update is a GRU and a residual MLP
+    (Locatello et al. 2020; TextOCVP equations 1 and 2).
     """
 
     def __init__(self, slot_dim: int, hidden: int) -> None:
@@ -141,14 +163,10 @@ class SlotAttention(nn.Module):
     def forward(
         self, slots_BKD: Tensor, features_BLD: Tensor, iterations: int, given_BKL: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the
-        slots.
+        """Corrected slots (B, K, D) and the last iteration's attention (B, K, L), which sums to 1 over the slots.
 
         Args:
             given_BKL: the attention of all iterations, where it is known (clusters); sums to 1 over the slots.
-
-        Raises:
-            ValueError: if `iterations` is below 1.
         """
         if iterations < 1:
             raise ValueError(f"slot attention needs at least 1 iteration, not {iterations}")
@@ -173,9 +191,8 @@ class SlotAttention(nn.Module):
 class SaviParser(SceneParser):
     """Slot attention for video over clips.
 
-    Slots keep their number through a clip. With the `gaussian` initializer two parses of one clip differ
-    unless the same generator state is given. With `cluster` the clusters are the attention on the first frame, and
-    slots compete for locations from the second frame on.
+    Slots keep their number through a clip. With `cluster` the clusters are the attention on the first frame, and slots
+    compete for locations from the second frame on.
     """
 
     Config = SaviConfig
@@ -186,7 +203,7 @@ class SaviParser(SceneParser):
         dim = config.layout.dim
         if config.encoder == "dinov2":
             self.dino = DinoEncoder(
-                config.encoder_weights or DINO_HUB_ID,
+                config.encoder_weights,
                 dim=config.encoder_dim,
                 patch=config.encoder_patch,
                 fingerprint=config.encoder_fingerprint,
@@ -201,14 +218,8 @@ class SaviParser(SceneParser):
             self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
-        self.transition = nn.TransformerEncoderLayer(
-            dim,
-            config.transition_heads,
-            config.transition_hidden,
-            dropout=0.0,
-            batch_first=True,
-            norm_first=True,
-        )
+        sizes = (dim, config.transition_heads, config.transition_hidden)
+        self.transition = nn.TransformerEncoderLayer(*sizes, dropout=0.0, batch_first=True, norm_first=True)
 
     def forward(
         self,
@@ -256,70 +267,3 @@ class SaviParser(SceneParser):
             if t + 1 < T:
                 guess_BKD = self.transition(slots_BKD)
         return Parsed(torch.stack(slots, dim=1), torch.stack(attention, dim=1), features_BTLF=features_BTLF)
-
-
-class GaussianInitializer(nn.Module):
-    """First slots drawn from one learned Gaussian, the same for every slot: their number is free at test
-    time."""
-
-    def __init__(self, slot_dim: int) -> None:
-        super().__init__()
-        self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
-        self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
-
-    def forward(
-        self,
-        batch: int,
-        num_slots: int,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Tensor:
-        """(batch, num_slots, D) slots."""
-        if isinstance(generator, Sequence):
-            noise_KD = [
-                torch.randn(num_slots, self.mean.shape[0], generator=g, device=g.device) for g in generator
-            ]
-            return self.mean + self.log_deviation.exp() * torch.stack(noise_KD).to(self.mean)
-        noise_BKD = torch.randn(
-            batch,
-            num_slots,
-            self.mean.shape[0],
-            generator=generator,
-            device=self.mean.device,
-            dtype=self.mean.dtype,
-        )
-        return self.mean + self.log_deviation.exp() * noise_BKD
-
-
-class ClusterSlots(nn.Module):
-    """First slots from clusters: the mean feature of each cluster, through a small MLP.
-
-    A cluster that has no pixels gives a slot of the learned empty content, which takes part like any other: in this
-    family a slot has no presence that could switch it off.
-
-    Args:
-        slot_dim: D.
-        clusters: finds them in what `forward` is given.
-    """
-
-    def __init__(self, slot_dim: int, clusters: ClusterInitializer) -> None:
-        super().__init__()
-        self.clusters = clusters
-        self.mlp = nn.Sequential(
-            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, slot_dim), nn.ReLU(), nn.Linear(slot_dim, slot_dim)
-        )
-        self.empty = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
-
-    def forward(self, seen_BCHW: Tensor, features_BDhw: Tensor, num_slots: int) -> tuple[Tensor, Tensor]:
-        """(B, num_slots, D) slots, and the share of every location (B, num_slots, h * w) that each cluster covers.
-
-        Args:
-            seen_BCHW: what is divided into clusters: frames, or the features of a frozen encoder.
-            features_BDhw: whose means the slots are made of.
-        """
-        found = self.clusters(seen_BCHW, num_slots)
-        shares_BKL = F.adaptive_avg_pool2d(
-            found.masks, (features_BDhw.shape[-2], features_BDhw.shape[-1])
-        ).flatten(2)
-        weights_BKL = shares_BKL / shares_BKL.sum(dim=-1, keepdim=True).clamp_min(1e-6)
-        slots_BKD = self.mlp(weights_BKL @ features_BDhw.flatten(2).transpose(1, 2))
-        return torch.where(found.presence[..., None] > 0, slots_BKD, self.empty), shares_BKL

@@ -13,15 +13,10 @@ PREDICTORS: dict[str, type[SlotPredictor]] = {"textocvp": TextOCVPPredictor, "oc
 
 
 def build_predictor(config: PredictorConfig, layout: SlotLayout, text_dim: int) -> SlotPredictor:
-    """The predictor that `config.kind` names.
-
-    Args:
-        config: its kind and sizes.
-        layout: what the numbers of a slot mean.
-        text_dim: width of the text tokens.
+    """The predictor that `config.kind` names, for text tokens of width `text_dim`.
 
     Raises:
-        ValueError: if there is no such kind, or the options do not fit each other or the layout.
+        ValueError: if there is no such kind, or the options do not fit each other.
     """
     if config.kind not in PREDICTORS:
         raise ValueError(f"unknown predictor.kind {config.kind!r}; known: {', '.join(PREDICTORS)}")

@@ -7,9 +7,8 @@ A predictor has one of two forms (`PredictorConfig.attention`):
 - `causal`, ours. A frame attends to itself and to earlier frames, and a code tells its number. So one pass trains all
   frames of an episode, and a rollout keeps keys and values and computes only the newest frame.
 
-With `layout.explicit` the network reads all of a slot and changes its content, position and scale. Unused slots are
-masked, and they and the background stay as they are. Slots are a set: their order changes nothing but the order of
-the prediction.
+With `layout.explicit` the network changes a slot's content, position and scale; unused slots and the background stay as
+they are. Unused slots are masked. Slots are a set: their order changes only the order of the prediction.
 """
 
 from __future__ import annotations
@@ -34,33 +33,21 @@ STEP = 0.1  # what an output of 1 means in position or log-scale: about what the
 
 @dataclass(frozen=True)
 class PredictorConfig:
-    """The options of every predictor. Sizes are the published ones.
+    """The options of every predictor. Sizes are the published ones."""
 
-    Attributes:
-        kind: a key of `textocvp.predictors.PREDICTORS`.
-        dim: width of a token.
-        layers: number of layers.
-        heads: attention heads of a layer.
-        hidden: hidden width of each feed-forward net.
-        attention: `window` (published) or `causal`; see the module.
-        window: the longest past in frames. For `causal` also the longest rollout.
-        age_encoding: `learned` (published) or `sinusoidal` time codes, one per frame for all its slots.
-        residual: predict the change of the slots (published) instead of the slots.
-        feed_forwards: feed-forward nets in a layer: 2 as in the authors' code, 1 as in the paper's text.
-        standardize: read and change content in units of its deviation over the training slots. The published model
-            does not; explicit slots always do.
-    """
-
-    kind: str
-    dim: int = 512
+    kind: str  # a name in `textocvp.predictors.PREDICTORS`
+    dim: int = 512  # width of a token
     layers: int = 8
-    heads: int = 8
-    hidden: int = 1024
-    attention: Literal["window", "causal"] = "window"
-    window: int = 10
+    heads: int = 8  # of a layer
+    hidden: int = 1024  # width within each feed-forward net
+    attention: Literal["window", "causal"] = "window"  # see the module
+    window: int = 10  # the longest past in frames; for `causal` also the longest rollout
+    # Of time codes, one per frame for all its slots.
     age_encoding: Literal["learned", "sinusoidal"] = "learned"
-    residual: bool = True
-    feed_forwards: Literal[1, 2] = 2
+    residual: bool = True  # predict the change of the slots instead of the slots
+    feed_forwards: Literal[1, 2] = 2  # nets in a layer: 2 as in the authors' code, 1 as in the paper's text
+    # Read and change content in units of its deviation over the training slots. The published model does not; explicit
+    # slots always do.
     standardize: bool = False
 
     @property
@@ -76,51 +63,31 @@ class PredictorConfig:
 
 @dataclass
 class Imagined:
-    """A rollout in slot space.
+    """A rollout in slot space."""
 
-    Attributes:
-        slots_BSKD: the S new frames.
-        attention_BSnhKL: text-to-slot attention of each new frame, n layers, h heads; sums to 1 over the words L.
-    """
-
-    slots_BSKD: Tensor
-    attention_BSnhKL: Tensor | None = None
+    slots_BSKD: Tensor  # the S new frames
+    attention_BSnhKL: Tensor | None = None  # to the text, of n layers and h heads; sums to 1 over the words L
 
 
 @dataclass
 class RolloutState:
-    """What a predictor keeps from step to step of a rollout.
+    """What a predictor keeps from step to step of a rollout."""
 
-    Attributes:
-        text: what `_text_context` returned, computed once.
-        caches: keys and values of earlier frames, one cache for each layer; None: every step computes them again.
-        unused_BMK: which slots are unused in the M frames that the newest one may attend to.
-        cached: how many of the M frames are in the caches.
-    """
-
-    text: Any
-    caches: list[KeyValueCache | None]
-    unused_BMK: Tensor
-    cached: int = 0
+    text: Any  # what `_text_context` returned, computed once
+    caches: list[KeyValueCache | None]  # one for each layer; None: every step computes keys and values again
+    unused_BMK: Tensor  # which slots are unused in the M frames that the newest one may attend to
+    cached: int = 0  # how many of the M frames are in the caches
 
 
 class SlotPredictor(nn.Module):
     """From the slots of some frames and a text to the slots of the next.
 
     Subclasses set `Config` and `uses_text`, and write `_layer`, `_transform` and, if they use text, `_text_context`.
-
-    Args:
-        config: sizes and form.
-        layout: what the numbers of a slot mean.
-        text_dim: width of the text tokens.
-
-    Raises:
-        ValueError: if the options do not fit each other or the layout.
     """
 
     Config: ClassVar[type[PredictorConfig]]
+    # Whether the text changes the prediction, and so whether there is attention to it.
     uses_text: ClassVar[bool]
-    """Whether the text changes the prediction, and so whether there is attention to its words."""
 
     content_mean_C: Tensor
     content_std_C: Tensor
@@ -149,8 +116,6 @@ class SlotPredictor(nn.Module):
         """Whether content is read and changed in units of its deviation over the training data."""
         return self.layout.explicit or self.config.standardize
 
-    # ---- what subclasses write
-
     @abstractmethod
     def _layer(self, text_dim: int) -> nn.Module:
         """A new layer."""
@@ -159,14 +124,11 @@ class SlotPredictor(nn.Module):
     def _transform(
         self, x_BTKC: Tensor, state: RolloutState, newest_only: bool
     ) -> tuple[Tensor, Tensor | None]:
-        """Apply the layers.
-
-        Args:
-            x_BTKC: one token for each slot of T frames, the last ones of `state.unused_BMK`.
-            newest_only: tokens of earlier frames than the newest are not needed.
+        """Apply the layers to one token for each slot of T frames, the last ones of `state.unused_BMK`.
 
         Returns:
-            Tokens (B, T or 1, K, C), and the newest frame's attention to the words (B, n, h, K, L), if any.
+            Tokens (B, T, K, C), or with `newest_only` (B, 1, K, C), and the newest frame's attention to the words
+            (B, n, h, K, L), if any.
         """
 
     def _text_context(self, text: TextTokens, slots_BKD: Tensor) -> Any:
@@ -176,8 +138,6 @@ class SlotPredictor(nn.Module):
     def _tokens_per_frame(self, slots: int) -> int:
         """How many tokens of a frame with so many slots enter a cache."""
         return slots
-
-    # ---- teacher forcing and rollouts
 
     def forward(self, slots_BTKD: Tensor, text: TextTokens) -> Tensor:
         """Teacher forced: `out[:, t]` is the prediction for frame t + 1.
@@ -200,12 +160,10 @@ class SlotPredictor(nn.Module):
         use_cache: bool = True,
         return_attention: bool = False,
     ) -> Imagined:
-        """Autoregressive and differentiable: predict S frames after the T seed frames, feeding predictions back.
+        """Predict `steps` (S) frames after T seed frames, feeding predictions back. Differentiable.
 
         Args:
-            steps: S.
             use_cache: keep keys and values (`causal` form only); changes the speed and not the result.
-            return_attention: also return the attention to the words.
 
         Raises:
             ValueError: if S < 1, if the `causal` form would need a past of more than `config.window` frames, if the
@@ -243,9 +201,8 @@ class SlotPredictor(nn.Module):
         """The state before the first step, with caches for so many frames, or without any."""
         tokens = cached_frames * self._tokens_per_frame(seed_BTKD.shape[2])
         caches = [KeyValueCache(tokens) if tokens else None for _ in self.layers]
-        return RolloutState(
-            self._text_context(text, seed_BTKD[:, -1]), caches, self.layout.used(seed_BTKD[:, :0])
-        )
+        context = self._text_context(text, seed_BTKD[:, -1])
+        return RolloutState(context, caches, self.layout.used(seed_BTKD[:, :0]))
 
     def _predict(
         self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool
@@ -263,8 +220,6 @@ class SlotPredictor(nn.Module):
         if newest_only:
             slots_BTKD, x_BTKC = slots_BTKD[:, -1:], x_BTKC[:, -1:]
         return self._update(slots_BTKD, self.slot_out(x_BTKC)), map_BnhKL
-
-    # ---- their parts
 
     def _masked(self, unused_BMK: Tensor, frames: int) -> Tensor:
         """(B, T, M, K) bool: what the last T frames may not attend to, unused slots and, if `causal`, later frames."""
@@ -307,10 +262,8 @@ class SlotPredictor(nn.Module):
         if len(text) != len(slots_BTKD):
             raise ValueError(f"{len(slots_BTKD)} scenes and {len(text)} texts: give one text for each scene")
         if not 1 <= past <= self.config.window:
-            raise ValueError(
-                f"this predictor was built for a past of 1 to {self.config.window} frames (`window`), "
-                f"this needs {past}"
-            )
+            window = f"1 to {self.config.window} frames (`window`)"
+            raise ValueError(f"this predictor was built for a past of {window}, this needs {past}")
 
 
 def feed_forward(config: PredictorConfig) -> nn.Sequential:

@@ -47,7 +47,7 @@ class OCVPSeqPredictor(SlotPredictor):
 
 
 class OCVPSeqLayer(nn.Module):
-    """Object attention, then time attention; each has a feed-forward net, or with `feed_forwards` = 1 only the last."""
+    """Object attention, then time attention; each has a feed-forward net, or with one net only the second."""
 
     def __init__(self, config: PredictorConfig) -> None:
         super().__init__()

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from textocvp.layers import MASKED, KeyValueCache, SelfAttention, TextAttention, mask_bias
 from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor, feed_forward
-from textocvp.slots import SlotLayout, SlotState
+from textocvp.slots import SlotState
 
 if TYPE_CHECKING:
     from textocvp.text.base import TextTokens
@@ -21,14 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TextOCVPConfig(PredictorConfig):
-    """Options of the published predictor.
-
-    Attributes:
-        color_bias: add `color_match` to the logits of the attention to the words. Needs explicit slots and a text
-            encoder whose words carry RGB. The published model does not do this.
-    """
+    """Options of the published predictor."""
 
     kind: Literal["textocvp"] = "textocvp"
+    # Add `color_match` to the logits of the attention to the words, which the published model does not do. Needs
+    # explicit slots and a text encoder whose words carry RGB.
     color_bias: bool = False
 
 
@@ -46,11 +43,6 @@ class TextOCVPPredictor(SlotPredictor):
     Config = TextOCVPConfig
     uses_text = True
     config: TextOCVPConfig
-
-    def __init__(self, config: TextOCVPConfig, layout: SlotLayout, text_dim: int) -> None:
-        if config.color_bias and not layout.explicit:
-            raise ValueError("color_bias needs slots with explicit colour (layout.explicit)")
-        super().__init__(config, layout, text_dim)
 
     def _layer(self, text_dim: int) -> nn.Module:
         return TextOCVPLayer(self.config, text_dim)
@@ -117,13 +109,11 @@ class TextOCVPLayer(nn.Module):
 
 
 def color_match(color_BK3: Tensor, used_BK: Tensor, text: TextTokens) -> Tensor:
-    """How well each slot's colour fits each word: minus the squared RGB distance, relative to the best used slot.
+    """How well each slot's colour fits each word (B, K, L): minus the squared RGB distance, relative to the best slot.
 
-    So the slots of a scene are compared with each other, and a lexicon's idea of a colour need not be the camera's.
-
-    Returns:
-        (B, K, L): 0 for the best used slot and for words that name no colour, below 0 otherwise.
+    It is 0 for the best used slot and for words that name no colour, below 0 otherwise.
     """
+    # The slots of a scene are compared with each other: a lexicon's idea of a colour need not be the camera's.
     match_BKL = -(color_BK3[:, :, None] - text.colors_BL3[:, None]).square().sum(dim=-1)
     best_B1L = match_BKL.masked_fill(~used_BK[..., None], MASKED).amax(dim=1, keepdim=True)
     return ((match_BKL - best_B1L) * text.names_color_BL[:, None]).clamp(max=0.0)

@@ -21,11 +21,5 @@ RENDERERS: dict[str, type[Renderer]] = {
 
 
 def build_renderer(config: RendererConfig, layout: SlotLayout, image_size: int) -> Renderer:
-    """The renderer that `config.kind` names, with random weights.
-
-    Args:
-        config: its kind and sizes.
-        layout: what the numbers of one slot mean.
-        image_size: side of the square frames it draws, in pixels.
-    """
+    """The renderer that `config.kind` names, with random weights; `image_size` is the frame's side in pixels."""
     return RENDERERS[config.kind](config, layout, image_size)  # type: ignore[call-arg, arg-type]

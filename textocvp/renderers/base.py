@@ -12,49 +12,31 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class RendererConfig:
-    """What every renderer is built from; a subclass adds its own options and refuses values that make no sense.
+    """What every renderer is built from; a subclass adds its own options and refuses values that make no sense."""
 
-    Attributes:
-        kind: name in `textocvp.renderers.RENDERERS`.
-    """
-
-    kind: str
+    kind: str  # a name in `textocvp.renderers.RENDERERS`
 
 
 @dataclass
 class Rendered:
-    """What slots look like.
+    """What slots look like."""
 
-    Attributes:
-        frames_B3HW: the composed frame, -1..1 (a renderer may overshoot slightly; `Rollout` clamps).
-        masks_BKHW: each slot's share of each pixel; sums to 1 over the slots.
-        draw_objects: makes `object_frames_BK3HW`.
-        features_BLF: the image features that the frame was drawn from, of L patches row by row; None for renderers
-            that draw pixels from slots.
-    """
-
-    frames_B3HW: Tensor
-    masks_BKHW: Tensor
-    draw_objects: Callable[[], Tensor]
+    frames_B3HW: Tensor  # the composed frame, -1..1; a renderer may overshoot slightly, `Rollout` clamps
+    masks_BKHW: Tensor  # each slot's share of each pixel; sums to 1 over the slots
+    draw_objects: Callable[[], Tensor]  # makes `object_frames_BK3HW`
+    # What the frame was drawn from, of L patches row by row; None for renderers that draw pixels from slots.
     features_BLF: Tensor | None = None
 
     @property
     def object_frames_BK3HW(self) -> Tensor:
-        """Each slot drawn alone, made when asked for, being K frames large.
-
-        The frame is their mask-weighted sum; with features, it is drawn from the mask-weighted sum of theirs.
-        """
+        """Each slot drawn alone. The frame is their mask-weighted sum, or drawn from that of their features."""
         return self.draw_objects()
 
 
 class Renderer(nn.Module):
     """Slots to pixels. Subclasses set `Config` and write `forward` and, where colours cost much, a cheaper `masks`.
 
-    They are built from (config, layout, image_size): their sizes, what the numbers of one slot mean, and the side of
-    the square frames in pixels.
-
-    Attributes:
-        Config: the class of its configuration.
+    They are built from (config, layout, image_size).
     """
 
     Config: ClassVar[type[RendererConfig]]
@@ -69,9 +51,5 @@ class Renderer(nn.Module):
         return self(slots_BKD).masks_BKHW
 
     def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Where a renderer that has to read this off unexplained slots takes them to be; None for all others.
-
-        Returns:
-            centres (x, y) in -1..1 and standard deviations along x and y in that unit, each (B, K, 2).
-        """
+        """Centres and standard deviations (x, y), each (B, K, 2) in -1..1, if it reads them off unexplained slots."""
         return None

@@ -1,7 +1,7 @@
 """The published renderer: a spatial broadcast decoder (Watters et al. 2019; TextOCVP-SAVi).
 
-Every slot is copied to every pixel, given a code of that pixel's place, and decoded by four convolutions to a
-colour and an alpha; the alphas of all slots become masks by a softmax over the slots.
+Every slot is copied to every pixel, given a code of that pixel's place, and decoded to a colour and an alpha. The
+alphas of all slots become masks by a softmax over the slots.
 """
 
 from __future__ import annotations
@@ -19,17 +19,14 @@ from textocvp.slots import SlotLayout
 
 @dataclass(frozen=True)
 class BroadcastConfig(RendererConfig):
-    """Options of `BroadcastRenderer`: `channels` is the width of its convolutions."""
+    """Options of `BroadcastRenderer`."""
 
     kind: Literal["broadcast"] = "broadcast"
-    channels: int = 32
+    channels: int = 32  # width of its convolutions
 
 
 class BroadcastRenderer(Renderer):
-    """Four 5x5 convolutions at full resolution, then one to RGB and alpha.
-
-    Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
-    """
+    """Four 5x5 convolutions at full resolution, then one to RGB and alpha. Slots are exchangeable."""
 
     Config = BroadcastConfig
 
@@ -38,17 +35,10 @@ class BroadcastRenderer(Renderer):
         self.image_size = image_size
         slot_dim, channels = layout.dim, config.channels
         self.position = PositionCode(slot_dim)
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(slot_dim, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, channels, 5, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(channels, 4, 3, padding=1),
-        )
+        blocks: list[nn.Module] = []
+        for inputs in (slot_dim, channels, channels, channels):
+            blocks += [nn.Conv2d(inputs, channels, 5, padding=2), nn.ReLU()]
+        self.convolutions = nn.Sequential(*blocks, nn.Conv2d(channels, 4, 3, padding=1))
 
     def forward(self, slots_BKD: Tensor) -> Rendered:
         B, K, D = slots_BKD.shape

@@ -20,26 +20,20 @@ from textocvp.slots import SlotLayout, SlotState
 
 @dataclass(frozen=True)
 class GlimpseConfig(RendererConfig):
-    """Options of `GlimpseRenderer`.
-
-    Attributes:
-        hidden: width of the decoder's fully connected layers.
-        crop_cells: side in cells of the canonical picture of a slot.
-        crop_extent: how many standard deviations that picture reaches to each side.
-    """
+    """Options of `GlimpseRenderer`."""
 
     kind: Literal["glimpse"] = "glimpse"
-    hidden: int = 256
-    crop_cells: int = 24
-    crop_extent: float = 2.6
+    hidden: int = 256  # width of the decoder's fully connected layers
+    crop_cells: int = 24  # side in cells of the canonical picture of a slot
+    crop_extent: float = 2.6  # how many standard deviations that picture reaches to each side
 
 
 class GlimpseRenderer(Renderer):
     """Draws every slot as a canonical picture in its own colour, at its own place and size, over one canvas.
 
     The content becomes `crop_cells`^2 cells of (alpha logit, shading). An object's colour is the slot's explicit
-    colour times its shading, so that a colour never seen in training is drawn as well as any other. The canvas, the
-    picture behind everything for the fixed camera, is the background slot's colour times a learned shading.
+    colour times its shading, so colours never seen in training are drawn as well as others. The canvas, the picture
+    behind everything for the fixed camera, is the background slot's colour times a learned shading.
     """
 
     Config = GlimpseConfig
@@ -58,7 +52,6 @@ class GlimpseRenderer(Renderer):
         self.canvas = nn.Parameter(torch.zeros(image_size, image_size))
 
     def forward(self, slots: Tensor) -> Rendered:
-        """Frames, masks and the slots' own pictures of slots (B, K, D); see `Rendered`."""
         state = SlotState.split(slots, self.layout)
         logits_BKHW, shading_BKHW = self._pictures(state).unbind(2)
         masks_BKHW = self._compete(logits_BKHW, state)
@@ -74,7 +67,7 @@ class GlimpseRenderer(Renderer):
         return Rendered(frames_B3N.unflatten(2, masks_BKHW.shape[2:]), masks_BKHW, draw_objects)
 
     def masks(self, slots: Tensor) -> Tensor:
-        """Masks (B, K, H, W) alone, at half the cost."""
+        """As `Renderer.masks`, at half the cost of `forward`."""
         state = SlotState.split(slots, self.layout)
         return self._compete(self._pictures(state, logits_only=True)[:, :, 0], state)
 

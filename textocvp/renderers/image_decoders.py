@@ -7,6 +7,7 @@ features become 384x384, and resize the result to the size of the frames.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -19,10 +20,7 @@ DOUBLINGS = 4
 class CnnDecoder(nn.Module):
     """Features (N, F, h, w) to frames (N, 3, H, W), about -1..1: four times 3x3 convolution, ReLU and doubling.
 
-    Args:
-        feature_dim: F.
-        channels: width of the first convolution, a multiple of 8; every later one is half as wide.
-        image_size: H and W.
+    `channels` is the width of the first convolution, a multiple of 8; every later one is half as wide.
     """
 
     def __init__(self, feature_dim: int, channels: int, image_size: int) -> None:
@@ -30,12 +28,8 @@ class CnnDecoder(nn.Module):
         self.image_size = image_size
         widths = [feature_dim, *(channels >> i for i in range(DOUBLINGS))]
         blocks: list[nn.Module] = []
-        for i in range(DOUBLINGS):
-            blocks += [
-                nn.Conv2d(widths[i], widths[i + 1], 3, padding=1),
-                nn.ReLU(),
-                nn.Upsample(scale_factor=2),
-            ]
+        for wide, narrow in pairwise(widths):
+            blocks += [nn.Conv2d(wide, narrow, 3, padding=1), nn.ReLU(), nn.Upsample(scale_factor=2)]
         self.blocks = nn.Sequential(*blocks, nn.Conv2d(widths[-1], 3, 3, padding=1))
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
@@ -45,10 +39,7 @@ class CnnDecoder(nn.Module):
 class VqganDecoder(nn.Module):
     """Features (N, F, h, w) to frames (N, 3, H, W), about -1..1: residual and non-local blocks, then doublings.
 
-    Args:
-        feature_dim: F.
-        channels: width of the first blocks, a multiple of 32; it is halved after the first, second and third doubling.
-        image_size: H and W.
+    `channels` is the width of the first blocks, a multiple of 32; the first three doublings halve it.
     """
 
     def __init__(self, feature_dim: int, channels: int, image_size: int) -> None:
@@ -56,17 +47,17 @@ class VqganDecoder(nn.Module):
         self.image_size = image_size
         blocks: list[nn.Module] = [
             nn.Conv2d(feature_dim, channels, 3, padding=1),
-            ResidualBlock(channels, channels),
+            ResidualBlock(channels),
             NonLocalBlock(channels),
-            ResidualBlock(channels, channels),
-            ResidualBlock(channels, channels),
+            ResidualBlock(channels),
+            ResidualBlock(channels),
             NonLocalBlock(channels),
         ]
         width = channels
         for i in range(DOUBLINGS):
             narrower = channels >> min(i + 1, 3)
             blocks += [nn.Upsample(scale_factor=2), nn.Conv2d(width, narrower, 3, padding=1)]
-            blocks += [ResidualBlock(narrower, narrower), ResidualBlock(narrower, narrower)]
+            blocks += [ResidualBlock(narrower), ResidualBlock(narrower)]
             width = narrower
         self.blocks = nn.Sequential(*blocks, _norm(width), nn.SiLU(), nn.Conv2d(width, 3, 3, padding=1))
 
@@ -77,16 +68,12 @@ class VqganDecoder(nn.Module):
 class ResidualBlock(nn.Module):
     """x + two times group norm, SiLU and 3x3 convolution."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            _norm(inputs),
-            nn.SiLU(),
-            nn.Conv2d(inputs, outputs, 3, padding=1),
-            _norm(outputs),
-            nn.SiLU(),
-            nn.Conv2d(outputs, outputs, 3, padding=1),
-        )
+        blocks: list[nn.Module] = []
+        for _ in range(2):
+            blocks += [_norm(channels), nn.SiLU(), nn.Conv2d(channels, channels, 3, padding=1)]
+        self.layers = nn.Sequential(*blocks)
 
     def forward(self, x_NCHW: Tensor) -> Tensor:
         return x_NCHW + self.layers(x_NCHW)
@@ -102,9 +89,8 @@ class NonLocalBlock(nn.Module):
         self.out = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x_NCHW: Tensor) -> Tensor:
-        query, key, value = (
-            self.query_key_value(self.norm(x_NCHW)).flatten(2).transpose(1, 2).chunk(3, dim=-1)
-        )
+        query_key_value = self.query_key_value(self.norm(x_NCHW)).flatten(2).transpose(1, 2)
+        query, key, value = query_key_value.chunk(3, dim=-1)
         weights_NLL = torch.softmax(query @ key.transpose(1, 2) * query.shape[-1] ** -0.5, dim=-1)
         mixed_NCHW = (weights_NLL @ value).transpose(1, 2).unflatten(2, x_NCHW.shape[2:])
         return x_NCHW + self.out(mixed_NCHW)
@@ -129,11 +115,7 @@ def check_channels(channels: int) -> None:
 def build_image_decoder(
     kind: Literal["cnn", "vqgan"], feature_dim: int, channels: int, image_size: int
 ) -> CnnDecoder | VqganDecoder:
-    """The decoder that `kind` names.
-
-    Raises:
-        ValueError: see `check_channels`.
-    """
+    """The decoder that `kind` names; errors as `check_channels`."""
     check_channels(channels)
     if kind == "cnn":
         return CnnDecoder(feature_dim, channels, image_size)

@@ -21,25 +21,17 @@ from textocvp.renderers.image_decoders import build_image_decoder, check_channel
 from textocvp.slots import SlotLayout
 
 FREQUENCIES = 4
-MIN_SCALE = 0.02
-"""Smallest standard deviation of the mask prior, in -1..1: two thirds of a pixel at 64x64."""
+MIN_SCALE = 0.02  # smallest standard deviation of the mask prior, in -1..1: two thirds of a pixel at 64x64
 
 
 @dataclass(frozen=True)
 class GridConfig(RendererConfig):
-    """Options of both renderers.
+    """Options of both renderers."""
 
-    Attributes:
-        patches: patches along a side of the frame.
-        layers: linear layers of the MLP, at least 2.
-        hidden: their width.
-        mask_prior: add a Gaussian at the place and of the size that a linear layer reads off the slot to the logits
-            of its mask.
-    """
-
-    patches: int = 16
-    layers: int = 4
-    hidden: int = 256
+    patches: int = 16  # along a side of the frame
+    layers: int = 4  # linear ones, of the MLP; at least 2
+    hidden: int = 256  # their width
+    # Add to the logits of a mask a Gaussian, whose place and size a linear layer reads off the slot.
     mask_prior: bool = False
 
     def __post_init__(self) -> None:
@@ -56,18 +48,12 @@ class PatchConfig(GridConfig):
 
 @dataclass(frozen=True)
 class FeatureConfig(GridConfig):
-    """Options of `FeatureRenderer`; `patches` and `feature_dim` must be those of the parser's frozen encoder.
-
-    Attributes:
-        feature_dim: width of the reconstructed features.
-        image_decoder: from features to pixels: `cnn` (published) or `vqgan` (larger and sharper).
-        image_channels: width of the first convolution of `cnn`; that of `vqgan` is half of it.
-    """
+    """Options of `FeatureRenderer`; `patches` and `feature_dim` must be those of the parser's frozen encoder."""
 
     kind: Literal["features"] = "features"
-    feature_dim: int = 768
-    image_decoder: Literal["cnn", "vqgan"] = "cnn"
-    image_channels: int = 1024
+    feature_dim: int = 768  # width of the reconstructed features
+    image_decoder: Literal["cnn", "vqgan"] = "cnn"  # features to pixels: published, or larger and sharper
+    image_channels: int = 1024  # width of the first convolution of `cnn`; that of `vqgan` is half of it
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,18 +68,7 @@ def position_code(cells: int) -> Tensor:
 
 
 class PatchDecoder(nn.Module):
-    """Slots (B, K, D) to `out_dim` numbers at each of `cells` x `cells` places, (B, K, L, out_dim).
-
-    The MLP's input is a slot beside the code of a place. Its first layer is linear in both, so it is computed once a
-    slot and once a place and added: the same function without the L times K copies of the slots.
-
-    Args:
-        slot_dim: D.
-        cells: side of the grid; L = cells * cells, row by row.
-        layers: linear layers of the MLP, at least 2.
-        hidden: their width.
-        out_dim: numbers a place.
-    """
+    """Slots (B, K, D) to `out_dim` numbers at each of L = `cells` x `cells` places, (B, K, L, out_dim), row by row."""
 
     codes_LC: Tensor
 
@@ -101,6 +76,8 @@ class PatchDecoder(nn.Module):
         super().__init__()
         codes_LC = position_code(cells)
         self.register_buffer("codes_LC", codes_LC, persistent=False)
+        # The first layer is linear in the slot and in the code of the place, so it is computed once for each and added:
+        # there are no L times K copies of the slots.
         self.slot = nn.Linear(slot_dim, hidden)
         self.place = nn.Linear(codes_LC.shape[-1], hidden, bias=False)
         inner: list[nn.Module] = [nn.ReLU()]
@@ -121,8 +98,7 @@ class PatchDecoder(nn.Module):
 class SlotPlace(nn.Module):
     """Reads a place and a size off a slot whose numbers are unexplained: one linear layer.
 
-    What they should be is known: mean and standard deviation of the grid under the slot's attention. Stage 1 holds
-    them to that (`textocvp.training.losses.read_place_loss`), and the image loss corrects them.
+    Stage 1 holds them to the moments of the slot's attention (`textocvp.training.losses.read_place_loss`).
     """
 
     def __init__(self, slot_dim: int) -> None:
@@ -146,10 +122,7 @@ def gaussian_prior(position_BK2: Tensor, scale_BK2: Tensor, height: int, width: 
 
 
 class GridRenderer(Renderer):
-    """What both renderers share: the MLP and, with `mask_prior`, the places that it reads off the slots.
-
-    Slots are exchangeable: reordering them reorders masks and object frames and leaves the frame as it is.
-    """
+    """What both renderers share: the MLP and, with `mask_prior`, the places read off the slots. These are a set."""
 
     def __init__(self, config: GridConfig, layout: SlotLayout, image_size: int, out_dim: int) -> None:
         super().__init__()

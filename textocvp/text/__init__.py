@@ -21,12 +21,10 @@ ENCODERS: dict[str, type[TextEncoder]] = {
 def build_text_encoder(config: TextConfig, files: Path | None = None) -> TextEncoder:
     """The text encoder that `config.kind` names.
 
-    Args:
-        files: the folder that `save_files` was given, of a checkpoint that is being loaded. A fine-tuned encoder is
-            then built from it alone, for the checkpoint's tensors to fill.
+    `files` is the folder that `save_files` was given, of a checkpoint that is being loaded. A fine-tuned encoder is
+    built from it alone, for the checkpoint's tensors to fill.
 
     Raises:
-        WeightsError: if its pretrained weights are missing or others than the configuration says; the message says
-            where to get them.
+        WeightsError: if pretrained weights are missing or not those of the configuration; it says where to get them.
     """
     return ENCODERS[config.kind](config, files)

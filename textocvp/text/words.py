@@ -1,7 +1,7 @@
 """Word-level text encoders trained from scratch.
 
 `transformer`: a learned embedding for every word, then a small transformer (the paper finds such an encoder equal to T5
-on CATER). `lexicon`: the same, but all colour words share one embedding and differ only in the RGB that a public
+on CATER). `lexicon`: the same, but all colour words share one embedding. They differ only in the RGB that a public
 lexicon gives for their name, so a colour that no caption ever named is understood like any other.
 """
 
@@ -26,10 +26,6 @@ from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBat
 SPECIAL = ("<pad>", "<unk>", "<color>")
 PAD, UNKNOWN, COLOR = range(3)
 
-# The words of the tabletop's sentences and its training colours: the vocabulary of the presets.
-GRAMMAR = ("put", "the", "block", "in", "bowl", "and", "then", "into", "a", "on", "place", "move", "of", "with",
-           "to")  # fmt: skip
-TRAIN_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
 
 _WORD = re.compile(r"[a-z0-9']+")
 
@@ -44,36 +40,28 @@ TABLEAU_10 = {
 
 @cache
 def palette() -> dict[tuple[str, ...], RGB]:
-    """Colour name, as a tuple of lower-case words, to RGB in 0..1.
-
-    Names that are no words ("blue/green") are left out.
-    """
+    """Colour name, as a tuple of lower-case words, to RGB in 0..1; without names that are no words ("blue/green")."""
     xkcd = {name.removeprefix("xkcd:"): value for name, value in XKCD_COLORS.items()}
     merged = {**xkcd, **CSS4_COLORS, **TABLEAU_10}  # later palettes win
     return {tuple(name.split()): to_rgb(value) for name, value in merged.items() if "/" not in name}
 
 
 @cache
-def longest_name() -> int:
-    """Words in the longest colour name."""
+def _longest_name() -> int:
     return max(map(len, palette()))
 
 
 @dataclass(frozen=True)
 class WordsConfig(TextConfig):
-    """Options of `WordEncoder`.
-
-    Attributes:
-        layers, heads, hidden: the transformer.
-        vocabulary: the words that have an embedding of their own, in the order of its rows.
-        untrained: those of them that no training caption contained. Their embeddings are still random.
-    """
+    """Options of `WordEncoder`."""
 
     kind: Literal["lexicon", "transformer"] = "lexicon"
     layers: int = 2
     heads: int = 4
     hidden: int = 256
-    vocabulary: tuple[str, ...] = GRAMMAR
+    # The words that have an embedding of their own, in the order of its rows.
+    vocabulary: tuple[str, ...] = ()
+    # Those that no training caption contained: their embeddings are still random.
     untrained: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -91,16 +79,12 @@ class WordsConfig(TextConfig):
         return self.kind == "lexicon"
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> WordsConfig:
-        """See `TextConfig.for_captions`. The lexicon's colours need no embedding, so they are no vocabulary."""
         found = {word for caption in captions for word in _WORD.findall(caption.lower())}
-        new = [word for word in vocabulary if _WORD.fullmatch(word)]
-        # In this order the words of a preset keep their rows, and with them a seed its weights.
-        colors = [color for color in TRAIN_COLORS if color in found.union(new)]
-        words = dict.fromkeys([*self.vocabulary, *colors, *new, *sorted(found)])
-        if self.words_have_rgb:
-            words = {word: None for word in words if word in self.vocabulary or (word,) not in palette()}
-        untrained = tuple(word for word in words if word not in found)
-        return replace(self, vocabulary=tuple(words), untrained=untrained)
+        new = [word for word in (*vocabulary, *sorted(found)) if _WORD.fullmatch(word)]
+        if self.words_have_rgb:  # the lexicon's colours need no embedding
+            new = [word for word in new if (word,) not in palette()]
+        words = tuple(dict.fromkeys([*self.vocabulary, *new]))  # known words keep their rows
+        return replace(self, vocabulary=words, untrained=tuple(word for word in words if word not in found))
 
 
 class _Block(nn.Module):
@@ -133,7 +117,7 @@ class WordEncoder(TextEncoder):
         nn.init.normal_(self.embedding.weight, std=0.5)
         with torch.no_grad():
             self.embedding.weight[PAD].zero_()
-        self.color_projection = nn.Linear(3, config.dim, bias=False) if self.words_have_rgb else None
+        self.color_projection = nn.Linear(3, config.dim, bias=False) if config.words_have_rgb else None
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.dim, eps=1e-6)
         self.register_buffer("positions_LC", sinusoids(config.max_tokens, config.dim), persistent=False)
@@ -143,12 +127,9 @@ class WordEncoder(TextEncoder):
         return self.embedding.weight.device
 
     def words(self, text: str) -> list[str]:
-        """The words of a sentence as the encoder sees them, lower case, one a token.
-
-        A colour name of several words ("light blue") is one token of the `lexicon` encoder.
-        """
+        """The words of a sentence in lower case; for the `lexicon` a name like "light blue" is one word."""
         found = _WORD.findall(text.lower())
-        if not self.words_have_rgb:
+        if not self.config.words_have_rgb:
             return found
         merged, at = [], 0
         while at < len(found):
@@ -159,7 +140,7 @@ class WordEncoder(TextEncoder):
         return merged
 
     def _color_length(self, words: list[str], at: int) -> int:
-        for length in range(min(longest_name(), len(words) - at), 1, -1):
+        for length in range(min(_longest_name(), len(words) - at), 1, -1):
             if tuple(words[at : at + length]) in palette():
                 return length
         return 1
@@ -167,7 +148,7 @@ class WordEncoder(TextEncoder):
     def _row_and_color(self, word: str) -> tuple[int, RGB | None]:
         if word in self._vocabulary:
             return self._vocabulary[word], None
-        color = palette().get(tuple(word.split())) if self.words_have_rgb else None
+        color = palette().get(tuple(word.split())) if self.config.words_have_rgb else None
         return (UNKNOWN, None) if color is None else (COLOR, color)
 
     def unknown_words(self, text: str) -> list[str]:
@@ -185,10 +166,8 @@ class WordEncoder(TextEncoder):
         if self.color_projection is not None:
             x_BLC = x_BLC + self.color_projection(words.colors_BL3) * words.names_color_BL[..., None]
         x_BLC = x_BLC + self.positions_LC[:length]
-        bias_B11L = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, -math.inf)[
-            :, None, None
-        ]
+        bias_BL = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, -math.inf)
         for block in self.blocks:
-            x_BLC = block(x_BLC, bias_B11L)
+            x_BLC = block(x_BLC, bias_BL[:, None, None])
         x_BLC = self.norm(x_BLC) * mask_BL[..., None]
         return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)

@@ -45,7 +45,7 @@ class Clips:
     Attributes:
         frames_BTHW3: uint8.
         seeds_B: one for each clip, for parsers that draw their first slots.
-        features_BTLF: of the frozen encoder, float16, where they are cached.
+        features_BTLF: of the frozen encoder, float16; None where they are not cached.
     """
 
     frames_BTHW3: Tensor
@@ -54,20 +54,13 @@ class Clips:
 
     def on(self, device: torch.device) -> tuple[Tensor, Tensor | None]:
         """Frames (B, T, 3, H, W) in -1..1 and features (B, T, L, F), both float32."""
-        known = self.features_BTLF
-        return to_frames(self.frames_BTHW3, device), None if known is None else known.to(device).float()
+        features = self.features_BTLF
+        return to_frames(self.frames_BTHW3, device), None if features is None else features.to(device).float()
 
 
 @dataclass(frozen=True)
 class ClipReader:
-    """Reads the clips of a step, in whichever process.
-
-    Attributes:
-        episodes: the training episodes.
-        args: the stage's settings.
-        rows: of the step's batch, those to read.
-        features: of the same episodes, if they are cached.
-    """
+    """Reads these rows of the batch of a step, in whichever process."""
 
     episodes: Episodes
     args: ClipTraining
@@ -87,15 +80,13 @@ class ClipReader:
         return clips
 
     def steps(self, run: Run, name: str) -> Iterator[tuple[int, Clips]]:
-        """The steps that are left of a run, each with its clips, read ahead by `args.workers` processes."""
+        """The steps that are left of a run, each with its clips."""
         batches = prefetch(self, range(run.first, self.args.steps), self.args.workers)
         return zip(run.steps(name), batches, strict=True)
 
 
 def clip_reader(run: Run, args: ClipTraining, episodes: Episodes, encoder: DinoEncoder | None) -> ClipReader:
-    """A reader of this process's clips; with `args.cache_features`, of their features too.
-
-    The features of all episodes are then computed first, each process doing its share.
+    """A reader of this process's clips; with `args.cache_features` the features of all episodes are computed first.
 
     Raises:
         SettingsError: if no episode is long enough for a clip, or there is no frozen encoder to cache features of.
@@ -108,15 +99,15 @@ def clip_reader(run: Run, args: ClipTraining, episodes: Episodes, encoder: DinoE
             f"clip={args.clip} and stride={args.stride} need episodes of {wanted} frames, the longest of "
             f"{args.data} has {longest}"
         )
-    if not args.cache_features:
-        return ClipReader(episodes, args, run.rows)
-    if encoder is None:
-        raise SettingsError(
-            "cache_features needs a frozen image encoder: set parser.encoder or vqvae.encoder to dinov2"
-        )
-    share = (run.accelerator.process_index, run.accelerator.num_processes)
-    features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)
-    run.accelerator.wait_for_everyone()
+    features = None
+    if args.cache_features:
+        if encoder is None:
+            raise SettingsError(
+                "cache_features needs a frozen image encoder: set parser.encoder or vqvae.encoder to dinov2"
+            )
+        share = (run.accelerator.process_index, run.accelerator.num_processes)
+        features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)
+        run.accelerator.wait_for_everyone()
     return ClipReader(episodes, args, run.rows, features)
 
 
@@ -125,20 +116,17 @@ def save_samples(
     episodes: Episodes,
     redraw: Callable[[int, Tensor, NDArray[np.int64]], Iterable[NDArray[np.uint8]]],
     device: torch.device | str,
-    *,
-    count: int = 4,
-    columns: int = 8,
 ) -> None:
-    """A picture of the first few episodes: a row of frames each, and below it the rows that `redraw` makes of them.
+    """A picture of the first four episodes: a row of eight frames each, and below it what `redraw` makes of them.
 
     Args:
         redraw: from an episode's number, its frames (T, 3, H, W) in -1..1, and the times that are shown, pictures
-            (columns, H, W, 3) for each row.
+            (8, H, W, 3) for each further row.
     """
     rows = []
-    for index in range(min(count, len(episodes))):
+    for index in range(min(4, len(episodes))):
         frames = episodes.frames(index)
-        times = np.linspace(0, len(frames) - 1, columns).round().astype(int)
+        times = np.linspace(0, len(frames) - 1, 8).round().astype(int)
         for strip in (frames[times], *redraw(index, to_frames(frames[None], device)[0], times)):
             rows.append(np.concatenate(list(strip), axis=1))
     path.parent.mkdir(parents=True, exist_ok=True)

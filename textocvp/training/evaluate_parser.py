@@ -29,15 +29,13 @@ NO_MASKS = "the held-out episodes have no masks: only the redrawn frames are mea
 class ParserMetrics(Metrics):
     """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval.
 
-    Without masks to compare, all but the PSNR is None: a model with one slot draws none, and episodes may have none.
-
     Attributes:
         object_miou: IoU of drawn masks with objects, Hungarian matching a frame.
         object_found: share of objects with an IoU above one half.
         followed: share of the first frame's objects whose slot keeps them through the whole episode.
         foreground_ari: adjusted Rand index without the background's pixels, the robot included.
         psnr: of the redrawn frames, dB.
-        left_out: why the others are None; empty where they are not.
+        left_out: why all but the PSNR are None; empty where they are not.
     """
 
     group: ClassVar[str] = "quality"
@@ -54,10 +52,7 @@ class ParserMetrics(Metrics):
         return f"{text} ({self.left_out})" if self.left_out else text
 
     def below_threshold(self) -> list[str]:
-        """A sentence for each figure below its threshold; empty for a parser that is good enough.
-
-        The thresholds are for slots that hold objects, so what was not measured is not below one.
-        """
+        """A sentence for each measured figure below its threshold; empty for a parser that is good enough."""
         measured = self.measured()
         return [
             f"{name} is {measured[name].value:.3f}, below its threshold of {threshold:.2f}"
@@ -73,9 +68,7 @@ def measure_parser(
     """Parse whole episodes and compare the drawn masks with the true ones.
 
     Args:
-        model: its parser and renderer are measured.
-        episodes: held-out episodes.
-        chosen: their numbers.
+        chosen: numbers of held-out episodes.
         frame_step: IoU, ARI and PSNR are taken at every `frame_step`-th frame; following always at every frame.
     """
     ious, found, follows, aris, psnrs = [], [], [], [], []
@@ -94,9 +87,8 @@ def measure_parser(
         truth = episodes.truth(index)
         if truth is None or truth.segmentation is None:
             continue
-        labels = rendered.masks_BKHW.argmax(1).cpu().numpy()
+        labels, segmentation = rendered.masks_BKHW.argmax(1).cpu().numpy(), truth.segmentation
         # All that is neither background nor robot is an object.
-        segmentation = truth.segmentation
         objects = [label for label in np.unique(segmentation).tolist() if label not in (0, truth.robot)]
         times = range(0, len(labels), frame_step)
         matches = np.concatenate([object_ious(labels[t], segmentation[t], objects).ious for t in times])

@@ -1,14 +1,13 @@
 """Does the imagined object end where the sentence says? Measured on held-out episodes, whose questions are asked.
 
-The first frame's true masks say which slot holds which object. That is for measuring only: nothing is trained on it,
-and the planner grounds slots by their looks (`planning`). Episodes without masks or questions, and slots without
-explicit places, are measured by how far imagined slots are from parsed ones.
+The first frame's true masks say which slot holds which object; nothing is trained on that. Episodes without masks or
+questions, and slots without explicit places, are measured by how far imagined slots are from parsed ones.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -70,7 +69,7 @@ class SlotErrors(Metrics):
     """How far imagined slots are from parsed ones, a mean over episodes with its 95 % bootstrap interval.
 
     Attributes:
-        error: distance of the places of slots that move, in pixels of 64; without explicit places the root mean square
+        error: distance of the places of slots that move, pixels of 64; without explicit places the root mean square
             error of all numbers of all slots. None where nothing moves.
         still_error: what it would be if nothing moved.
         left_out: why instruction following was not measured.
@@ -86,14 +85,7 @@ class SlotErrors(Metrics):
 
 @dataclass(frozen=True)
 class Trial:
-    """A sentence for an episode, and the outcome that is looked for.
-
-    Attributes:
-        episode: its number.
-        text: the sentence.
-        moves: the slot that should move; -1 if no slot holds the object.
-        ends_at: the slot where it should end; -1 likewise.
-    """
+    """A sentence for an episode, the slot that should move, and that at which it should end; -1 if there is none."""
 
     episode: int
     text: str
@@ -117,11 +109,7 @@ class Trials:
         slot_of: Mapping[int, int],
         rng: np.random.Generator,
     ) -> None:
-        """Add what a scene allows: the sentence that was played, its object moved elsewhere, and any other sentence.
-
-        Args:
-            slot_of: the slot that holds each object, by the object's id; -1 for none.
-        """
+        """Add what a scene allows. `slot_of` is the slot that holds each object, by the object's id; -1 for none."""
         moves, ends_at = slot_of[played.moves], slot_of[played.ends_at]
         self.original.append(Trial(episode, played.text, moves, ends_at))
         elsewhere = [q for q in questions if q.moves == played.moves and q.ends_at != played.ends_at]
@@ -136,14 +124,7 @@ class Trials:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out episodes as slots, and what is asked of them.
-
-    Attributes:
-        slots_ETKD: true slots of whole episodes, padded with their last frame.
-        instructions: their sentences.
-        layout: what the numbers of a slot mean.
-        trials: empty where instruction following cannot be measured; then slot errors are.
-    """
+    """Held-out episodes as true slots, padded with their last frame, and what is asked of them, if anything can be."""
 
     slots_ETKD: Tensor
     instructions: tuple[str, ...]
@@ -151,11 +132,9 @@ class HeldOut:
     trials: Trials
 
     @classmethod
-    def of(
-        cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, seed: int = 0
-    ) -> HeldOut:
-        """Held-out episodes at a length of so many frames; `seed` picks what is asked."""
-        rng, trials = np.random.default_rng(seed), Trials()
+    def of(cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int) -> HeldOut:
+        """Held-out episodes at a length of so many frames."""
+        rng, trials = np.random.default_rng(0), Trials()
         for index in range(len(episodes)) if layout.explicit else ():
             truth = episodes.truth(index)
             played = truth and truth.question(episodes.instructions[index])
@@ -176,7 +155,7 @@ class HeldOut:
 
     def measure(self, model: TextOCVP, count: int | None = None) -> InstructionFollowing | SlotErrors:
         """Figures of the first `count` episodes (default: all)."""
-        return (evaluate_following if self.trials.original else evaluate_slots)(model, self, count)
+        return (_following if self.trials.original else _slot_errors)(model, self, count)
 
 
 def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -187,55 +166,52 @@ def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
 
 
 def slot_at(state: SlotState, place_2: Tensor, size_2: Tensor) -> int:
-    """The slot of a frame that is of this place and size; -1 if there is none close enough.
-
-    An object may lie in the middle of another, and only its size tells the two apart.
-    """
+    """The slot of a frame that is of this place and size; -1 if there is none close enough."""
+    # An object may lie in the middle of another, and only its size tells the two apart.
     off_K = (state.position - place_2).norm(dim=-1)
     other_size_K = (state.scale - size_2).norm(dim=-1)
     cost_K = (off_K + other_size_K).masked_fill(~state.is_thing[:, 0] | ~(off_K < MATCHED), math.inf)
     return int(cost_K.argmin()) if cost_K.isfinite().any() else -1
 
 
-def evaluate_following(model: TextOCVP, held: HeldOut, count: int | None = None) -> InstructionFollowing:
-    """Imagine the trials of the first `count` episodes (default: all) and see where the objects end."""
+def _following(model: TextOCVP, held: HeldOut, count: int | None) -> InstructionFollowing:
+    """Imagine the trials and see where the objects end."""
     places_ETK2 = SlotState.split(held.slots_ETKD, held.layout).position
-
-    def reached(asked: list[Trial], ends_NK2: list[Tensor]) -> float:
-        return _share(
-            trial.moves >= 0
-            and trial.ends_at >= 0
-            and float((ends_K2[trial.moves] - places_ETK2[trial.episode, 0, trial.ends_at]).norm()) < REACHED
-            for trial, ends_K2 in zip(asked, ends_NK2, strict=True)
-        )
-
-    chosen = [
-        [trial for trial in kind if count is None or trial.episode < count]
-        for kind in (held.trials.original, held.trials.other_target, held.trials.wrong_text)
-    ]
-    ends = [_ends(model, held, asked) for asked in chosen]
-    errors = [
-        float((ends_K2[trial.moves] - places_ETK2[trial.episode, -1, trial.moves]).norm())
-        for trial, ends_K2 in zip(chosen[0], ends[0], strict=True)
-        if trial.moves >= 0
-    ]
-    original, other_target, wrong_text = map(reached, chosen, ends)
-    grounded = _share(trial.moves >= 0 and trial.ends_at >= 0 for trial in chosen[0])
-    error_px = float(np.median(errors)) / PIXEL if errors else math.nan
-    return InstructionFollowing(original, other_target, wrong_text, error_px, grounded, len(chosen[0]))
-
-
-def evaluate_slots(model: TextOCVP, held: HeldOut, count: int | None = None) -> SlotErrors:
-    """Imagine the first `count` episodes (default: all) with their own sentences, and compare with the true slots."""
+    shares: dict[str, float] = {}
     errors: list[float] = []
-    still_errors: list[float] = []
-    slots_ETKD, sentences = held.slots_ETKD[:count], held.instructions[:count]
-    for at in range(0, len(sentences), BATCH):
-        true_BTKD = slots_ETKD[at : at + BATCH]
-        imagined_BSKD = _imagined(model, true_BTKD, sentences[at : at + BATCH])
-        for true_TKD, imagined_SKD in zip(true_BTKD, imagined_BSKD, strict=True):
-            errors.append(_slot_error(imagined_SKD, true_TKD, held.layout))
-            still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, held.layout))
+    both_found: list[bool] = []
+    for kind, trials in vars(held.trials).items():
+        asked = [trial for trial in trials if count is None or trial.episode < count]
+        slots_NTKD = held.slots_ETKD[[trial.episode for trial in asked]]
+        reached = []
+        imagined = _imagine(model, slots_NTKD, [trial.text for trial in asked])
+        for trial, imagined_SKD in zip(asked, imagined, strict=True):
+            ends_K2, true_TK2 = (
+                SlotState.split(imagined_SKD[-1], held.layout).position,
+                places_ETK2[trial.episode],
+            )
+            found = trial.moves >= 0 and trial.ends_at >= 0
+            away = float((ends_K2[trial.moves] - true_TK2[0, trial.ends_at]).norm())
+            reached.append(found and away < REACHED)
+            if kind == "original":
+                both_found.append(found)
+                if trial.moves >= 0:
+                    errors.append(float((ends_K2[trial.moves] - true_TK2[-1, trial.moves]).norm()))
+        shares[kind] = _share(reached)
+    error_px = float(np.median(errors)) / PIXEL if errors else math.nan
+    return InstructionFollowing(
+        **shares, error_px=error_px, grounded=_share(both_found), episodes=len(both_found)
+    )
+
+
+def _slot_errors(model: TextOCVP, held: HeldOut, count: int | None) -> SlotErrors:
+    """Imagine the episodes with their own sentences, and compare with the true slots."""
+    errors, still_errors = [], []
+    slots_ETKD = held.slots_ETKD[:count]
+    imagined = _imagine(model, slots_ETKD, held.instructions[:count])
+    for true_TKD, imagined_SKD in zip(slots_ETKD, imagined, strict=True):
+        errors.append(_slot_error(imagined_SKD, true_TKD, held.layout))
+        still_errors.append(_slot_error(true_TKD[:1].expand_as(imagined_SKD), true_TKD, held.layout))
     left_out = NO_QUESTIONS if held.layout.explicit else NO_PLACES
     if np.isnan(errors).all():
         return SlotErrors(None, None, left_out)
@@ -252,25 +228,15 @@ def _slot_error(imagined_SKD: Tensor, true_TKD: Tensor, layout: SlotLayout) -> f
 
 
 @torch.no_grad()
-def _imagined(model: TextOCVP, slots_BTKD: Tensor, sentences: Sequence[str]) -> Tensor:
-    """The slots (B, T - 1, K, D) that follow the first frames."""
-    with evaluating(model):
-        text = model.text(sentences)
-        rollout = model.predictor.rollout(slots_BTKD[:, :1].to(model.device), text, slots_BTKD.shape[1] - 1)
-    return rollout.slots_BSKD.float().cpu()
+def _imagine(model: TextOCVP, slots_NTKD: Tensor, sentences: Sequence[str]) -> Iterator[Tensor]:
+    """The slots (T - 1, K, D) that follow each first frame."""
+    for at in range(0, len(sentences), BATCH):
+        first_B1KD = slots_NTKD[at : at + BATCH, :1].to(model.device)
+        with evaluating(model):
+            text = model.text(sentences[at : at + BATCH])
+            rollout = model.predictor.rollout(first_B1KD, text, slots_NTKD.shape[1] - 1)
+        yield from rollout.slots_BSKD.float().cpu()
 
 
-def _ends(model: TextOCVP, held: HeldOut, asked: list[Trial]) -> list[Tensor]:
-    """Where the slots end when each sentence is carried out, (K, 2) for each trial."""
-    ends: list[Tensor] = []
-    for at in range(0, len(asked), BATCH):
-        chosen = asked[at : at + BATCH]
-        true_BTKD = held.slots_ETKD[[trial.episode for trial in chosen]]
-        last_BKD = _imagined(model, true_BTKD, [trial.text for trial in chosen])[:, -1]
-        ends.extend(SlotState.split(last_BKD, held.layout).position)
-    return ends
-
-
-def _share(outcomes: Iterable[bool]) -> float:
-    values = list(outcomes)
-    return sum(values) / len(values) if values else math.nan
+def _share(outcomes: Sequence[bool]) -> float:
+    return sum(outcomes) / len(outcomes) if outcomes else math.nan

@@ -4,35 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
-from textocvp.renderers.base import Rendered
+from textocvp.renderers.base import Rendered, Renderer
 from textocvp.slots import SlotLayout, SlotState, moments
 
 MOVES = 0.015  # a slot moves when its centre shifts by more than this in a frame, -1..1: half a pixel of 64
 UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
 
 
-class LossTerms:
-    """The terms of a loss: a dataclass of scalars."""
-
-    def as_metrics(self) -> dict[str, Tensor]:
-        """The terms, named for a log."""
-        return {f"loss/{name}": value.detach() for name, value in vars(self).items()}
-
-
 @dataclass
-class ParserLoss(LossTerms):
-    """The terms of stage 1, each a scalar.
+class ParserLoss:
+    """The terms of stage 1, each a scalar, 0 where a model has nothing to compare.
 
     Attributes:
-        image: mean squared error of the reconstruction, things weighted above the canvas.
-        mask: cross-entropy of the drawn masks against the parser's attention.
-        place: squared error of the places that the transition expected against those the corrector found; for slots
-            without explicit places, of those that the renderer reads off them against those of their attention.
-        feature: mean squared error of the reconstructed features, for renderers that have any.
+        image: `image_loss` of the redrawn frames.
+        mask: `mask_loss`.
+        place: `place_loss`; for slots without explicit places `read_place_loss`.
+        feature: mean squared error of the reconstructed features.
     """
 
     image: Tensor
@@ -47,13 +40,11 @@ class ParserLoss(LossTerms):
         )
 
 
-def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
-    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things.
-
-    A pixel shows a thing where it differs from its image's median colour by more than `threshold`: no labels needed.
-    """
+def thing_weights(target: Tensor, thing_weight: float) -> Tensor:
+    """Weights (B, 1, H, W) of the pixels of frames (B, 3, H, W) in -1..1: 1, and `thing_weight` more on things."""
+    # A pixel shows a thing where it differs from its image's median colour: no labels needed.
     median = target.flatten(-2).median(-1).values[..., None, None]
-    thing = (target - median).abs().amax(-3, keepdim=True) > threshold
+    thing = (target - median).abs().amax(-3, keepdim=True) > 0.08
     return 1 + thing_weight * thing.to(target.dtype)
 
 
@@ -61,8 +52,8 @@ def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tenso
     """Weighted mean squared error of the composed frames against frames (B, 3, H, W).
 
     Args:
-        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
-            up to that of the batch.
+        weights: from `thing_weights`.
+        whole: their sum over the whole batch, where these frames are a part of it; the parts' losses then add up.
     """
     whole = weights.sum() if whole is None else whole
     return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * whole)
@@ -71,49 +62,42 @@ def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tenso
 def mask_loss(
     rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None
 ) -> Tensor:
-    """Weighted cross-entropy of the drawn masks against the attention's winners; no gradient enters the attention.
+    """Weighted cross-entropy of the drawn masks against the attention's winners (self-distillation, as in SPOT, 2024).
 
-    The renderer sees only the slots, the attention also the pixels: agreeing with it teaches the renderer where a
-    slot ends long before the image loss alone would, and without labels (self-distillation, as in SPOT, 2024).
-    `whole` is as in `image_loss`.
+    No gradient enters the attention. `weights` and `whole` are as in `image_loss`.
     """
+    # The attention sees the pixels, the renderer only the slots: this teaches it early where a slot ends.
     log_masks = rendered.masks_BKHW.clamp_min(1e-6).log()
     per_pixel = F.nll_loss(log_masks, attention_BKHW.argmax(1), reduction="none")
     return (weights[:, 0] * per_pixel).sum() / (weights.sum() if whole is None else whole)
 
 
 def place_loss(expected: SlotState, found: SlotState) -> Tensor:
-    """Mean squared error of expected places and log-sizes, over the things of each clip, then over the clips (B, T, K).
+    """Squared error of expected places and log-sizes, the mean over each clip's things, then over the clips (B, T, K).
 
     No gradient enters `found`.
     """
     wanted = torch.cat([found.position, found.scale.log()], dim=-1).detach()
     error = (torch.cat([expected.position, expected.scale.log()], dim=-1) - wanted).square().mean(-1)
     things = found.is_thing[..., 0]
-    error_B = torch.where(things, error, torch.zeros_like(error)).sum((1, 2)) / things.sum((1, 2)).clamp_min(
-        1
-    )
-    return error_B.mean()
+    sum_B = torch.where(things, error, torch.zeros_like(error)).sum((1, 2))
+    return (sum_B / things.sum((1, 2)).clamp_min(1)).mean()
 
 
 def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Tensor) -> Tensor:
-    """Mean squared error of places and log-sizes against mean and deviation of the grid under the attention.
-
-    No gradient enters the attention.
-    """
+    """Mean squared error of places and log-sizes against those of the attention, which no gradient enters."""
     center_BK2, deviation_BK2 = moments(attention_BKHW.detach())
     return ((position_BK2 - center_BK2).square() + (scale_BK2 / deviation_BK2).log().square()).mean()
 
 
 @dataclass
-class SlotLoss(LossTerms):
-    """The terms, each a scalar averaged over slots with the weights of the moving ones.
+class SlotLoss:
+    """The terms of stage 2, each a scalar averaged over slots.
 
     Attributes:
         position: Huber loss of the centre, in units of about a pixel.
         scale: squared error of the log-scale, in tenths.
-        content: squared error of the content in units of its standard deviation (of the content as it is where
-            none is given). Without explicit channels the whole slot is content.
+        content: squared error of the content, or of the whole slot if it has no explicit channels.
     """
 
     position: Tensor
@@ -131,19 +115,14 @@ def slot_loss(
     weights_BTK: Tensor,
     layout: SlotLayout,
     content_std_C: Tensor | None,
-    *,
-    whole: Tensor | float | None = None,
 ) -> SlotLoss:
     """Compare predicted slots with the parser's.
 
     Args:
-        weights_BTK: how much each slot counts, see `moving_weights`.
-        content_std_C: standard deviation of each content channel over the training slots; None for slots without
-            explicit channels that are compared as they are.
-        whole: the sum of the weights of the whole batch, when these are a part of it: the losses of all parts then add
-            up to that of the batch.
+        weights_BTK: how much each slot counts, see `moving_weights`; they sum to 1 over a batch.
+        content_std_C: standard deviation of each content channel over the training slots, in which its error is
+            counted; None for slots without explicit channels that are compared as they are.
     """
-    weights_BTK = weights_BTK / (weights_BTK.sum().clamp(min=1e-6) if whole is None else whole)
     if not layout.explicit:
         error_BTKD = predicted_BTKD - target_BTKD
         if content_std_C is not None:
@@ -165,19 +144,13 @@ def slot_loss(
 
 
 def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, ever: bool) -> Tensor:
-    """How much each slot of the frames 1..T-1 counts: `moving` where it moves, 1 where it stands still, 0 if
-    unused.
-
-    Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
+    """How much each true slot of frames 1 to T - 1 counts (B, T - 1, K): `moving` where it moves, else 1; 0 if unused.
 
     Args:
-        slots_BTKD: the true slots of T frames.
         ever: weigh a slot that moves anywhere in these frames alike in all of them. For rollouts, where a
             slot that has come to rest in the wrong place is still wrong.
-
-    Returns:
-        (B, T - 1, K).
     """
+    # Most slots of most frames stand still; unweighted, "nothing moves" is almost the best answer.
     if not layout.explicit:
         return slots_BTKD.new_ones(slots_BTKD[:, 1:, :, 0].shape)
     state = SlotState.split(slots_BTKD, layout)
@@ -186,3 +159,12 @@ def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, eve
         moves_BTK = moves_BTK.any(dim=1, keepdim=True).expand_as(moves_BTK)
     present_BTK = state.presence[:, 1:, :, 0] >= 0.5
     return present_BTK * (1.0 + (moving - 1.0) * moves_BTK)
+
+
+def drawn_loss(
+    renderer: Renderer, predicted_BSKD: Tensor, drawn_BF: NDArray[np.int64], true_BF3HW: Tensor
+) -> Tensor:
+    """Mean squared error of the frames `drawn_BF` of the S predicted ones; its gradient flows through the renderer."""
+    slots_BFKD = predicted_BSKD[torch.arange(len(drawn_BF))[:, None], torch.from_numpy(drawn_BF)]
+    frames = renderer(slots_BFKD.flatten(0, 1)).frames_B3HW
+    return (frames - true_BF3HW.to(frames.device).flatten(0, 1)).square().mean()

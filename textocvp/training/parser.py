@@ -78,8 +78,8 @@ class ParserStage(nn.Module):
             weights_N1HW: how much each pixel of the N = B * T frames counts, see `thing_weights`.
             whole: the sum of those weights over the whole batch; None for clips that are a whole batch.
             weight: how much of the batch these clips are.
-            generator: for parsers that draw their first slots, one for each clip.
-            features_BTLF: of the parser's frozen encoder, where they are known already.
+            generator: one for each clip, for parsers that draw their first slots.
+            features_BTLF: of the parser's frozen encoder, where they are cached.
         """
         known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
         parsed = self.parser(frames_BT3HW, generator=generator, **known)
@@ -102,9 +102,10 @@ class ParserStage(nn.Module):
 
 
 def train(args: ParserTraining) -> ParserMetrics | None:
-    """Run or continue stage 1; writes `out`/checkpoint and returns the final figures on the held-out episodes.
+    """Run or continue stage 1; writes `out`/checkpoint.
 
-    They are None on all processes but the main one.
+    Returns:
+        figures of all held-out episodes; None on all processes but the main one.
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
@@ -139,7 +140,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                     features_BTLF=None if features_BTLF is None else features_BTLF[part],
                 )
                 total = loss.total(args.mask_weight, args.place_weight, args.feature_weight)
-                run.backward(total, loss.as_metrics())
+                run.backward(total, vars(loss))
             run.update(step)
             run.evaluate(step, measure, lambda path: draw_samples(model, held_out, path))
         metrics = run.finish(model.save_pretrained, measure, "quality.json")
@@ -151,17 +152,14 @@ def train(args: ParserTraining) -> ParserMetrics | None:
 
 @torch.no_grad()
 def draw_samples(model: TextOCVP, episodes: Episodes, path: Path) -> None:
-    """A picture with three rows an episode: frames, frames redrawn from their slots, and the slots' masks.
-
-    One slot has no mask worth a row.
-    """
+    """A picture with three rows an episode: frames, frames redrawn from their slots, and the slots' masks."""
 
     def redraw(index: int, frames_T3HW: Tensor, times: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
         seeded = torch.Generator(model.device).manual_seed(index)
         slots_NKD = model.parser(frames_T3HW[None], generator=seeded).slots_BTKD[0, times]
         rendered = model.renderer(slots_NKD)
         yield to_pictures(rendered.frames_B3HW)
-        if slots_NKD.shape[1] > 1:
+        if slots_NKD.shape[1] > 1:  # one slot has no mask worth a row
             yield color_masks(rendered.masks_BKHW.cpu().numpy())
 
     save_samples(path, episodes, redraw, model.device)

@@ -3,12 +3,10 @@
     textocvp train predictor --parser runs/parser/checkpoint --data data/tabletop-train.h5 \\
         --val data/tabletop-val.h5 --out runs/predictor
 
-Every episode is parsed once. Then the `causal` form learns from whole episodes, all frames in one pass: first
-teacher forced; then the model imagines a growing part of the episode, up to all of it, and from its own
-imagined frames must predict the true next ones (dataset aggregation, Ross et al. 2011: what rollouts need,
-for little more than the price of teacher forcing). The published `window` form sees both ways and so cannot
-be teacher forced in one pass: it learns from rollouts, with the gradient flowing back through them, as
-published.
+Every episode is parsed once. The `causal` form then learns from all frames of an episode in one pass. First it is
+teacher forced. Later it imagines a growing part of the episode, and predicts the true next frames from its own
+imagined ones (dataset aggregation, Ross et al. 2011). The published `window` form sees both ways, so it cannot be
+teacher forced in one pass: it learns from rollouts, and the gradient flows back through them.
 """
 
 from __future__ import annotations
@@ -22,19 +20,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from textocvp.checkpoint import resolve_checkpoint
 from textocvp.config import with_settings
 from textocvp.data.cache import cached_slots
-from textocvp.data.episodes import Episodes, words_of
+from textocvp.data.episodes import words_of
 from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP
-from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
-from textocvp.text.base import TextEncoder, WordBatch
+from textocvp.text.base import WordBatch
 from textocvp.text.words import WordsConfig
 from textocvp.training.evaluate_predictor import HeldOut, InstructionFollowing, SlotErrors
-from textocvp.training.losses import moving_weights, slot_loss
+from textocvp.training.losses import drawn_loss, moving_weights, slot_loss
 from textocvp.training.run import (
     Run,
     SettingsError,
@@ -74,12 +70,6 @@ class PredictorTraining(TrainingSettings):
     """Weight of the error in size."""
     content_weight: float = 0.3
     """Weight of the error in content."""
-    recolor: bool = True
-    """Permute the colour channels of scene and lexicon together (text kind `lexicon`; no other words follow)."""
-    color_jitter: float = 0.03
-    """Standard deviation of the shift of each slot's and each word's colour, in -1..1."""
-    place_jitter: float = 0.01
-    """Standard deviation of the noise on the teacher's slot places, in -1..1."""
     image_weight: float = 0.0
     """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
     image_frames: int = 2
@@ -91,8 +81,7 @@ class PredictorStage(nn.Module):
 
     def __init__(self, model: TextOCVP) -> None:
         super().__init__()
-        self.text: TextEncoder = model.text
-        self.predictor: SlotPredictor = model.predictor
+        self.text, self.predictor = model.text, model.predictor
         if not self.predictor.uses_text:  # several processes would wait for gradients that never come
             self.text.requires_grad_(False)
 
@@ -114,48 +103,6 @@ class PredictorStage(nn.Module):
         return self.predictor(given_BTKD, text)
 
 
-@dataclass
-class StepBatch:
-    """What one update learns from, of all processes together or of some rows.
-
-    Attributes:
-        imagined: how many frames the model adds itself to those that it is given.
-        given_BTKD: the true slots of the first frames, a little off their places.
-        words: the sentences.
-        target_BSKD: the true slots of the frames that are predicted.
-        weights_BSK: how much each of them counts; over all rows of the batch they sum to 1.
-        episodes_B: numbers of the episodes.
-        channels_B3: the order in which their colour channels are.
-        drawn_BF: which of the S predicted frames are drawn for the image loss.
-        times_BF: their numbers in the episode.
-    """
-
-    imagined: int
-    given_BTKD: Tensor
-    words: WordBatch
-    target_BSKD: Tensor
-    weights_BSK: Tensor
-    episodes_B: np.ndarray
-    channels_B3: Tensor
-    drawn_BF: np.ndarray
-    times_BF: np.ndarray
-
-    def __getitem__(self, rows: slice) -> StepBatch:
-        whole = {name: value for name, value in vars(self).items() if name not in ("imagined", "words")}
-        cut = {name: value[rows] for name, value in whole.items()}
-        return StepBatch(imagined=self.imagined, words=self.words.select(rows), **cut)
-
-    def to(self, device: torch.device) -> StepBatch:
-        """With what the model computes with on its device."""
-        return replace(
-            self,
-            given_BTKD=self.given_BTKD.to(device),
-            words=self.words.to(device),
-            target_BSKD=self.target_BSKD.to(device),
-            weights_BSK=self.weights_BSK.to(device),
-        )
-
-
 def schedule(
     args: PredictorTraining, causal: bool, step: int, frames: int, rng: np.random.Generator
 ) -> tuple[int, int]:
@@ -174,38 +121,12 @@ def schedule(
     return (frames - horizon if causal else int(rng.integers(1, frames - horizon + 1))), horizon - 1
 
 
-def draw_batch(args: PredictorTraining, batches: SlotBatches, causal: bool, step: int) -> StepBatch:
-    """What all processes together learn from in update number `step`."""
-    rng = step_rng(args.seed, step)
-    episodes = batches.draw(rng, args.batch)
-    given, imagined = schedule(args, causal, step, batches.frames, rng)
-    given_BTKD = batches.noisy(rng, episodes.slots_BTKD[:, :given])
-    rng.random(args.batch)  # not used any more; without it a seed would give other runs than it always did
-    last = given + imagined  # the number of the last frame that is predicted
-    # The causal form predicts from every frame the next, the window form only new frames.
-    predictions = last if causal else imagined + 1
-    first = last + 1 - predictions
-    drawn_BF = rng.integers(predictions, size=(args.batch, args.image_frames))
-    true_BTKD = episodes.slots_BTKD[:, first - 1 : last + 1]
-    weights_BSK = moving_weights(true_BTKD, batches.layout, args.moving, ever=imagined > 0)
-    return StepBatch(
-        imagined=imagined,
-        given_BTKD=given_BTKD,
-        words=episodes.words,
-        target_BSKD=true_BTKD[:, 1:],
-        weights_BSK=weights_BSK / weights_BSK.sum().clamp(min=1e-6),
-        episodes_B=episodes.episodes_B,
-        channels_B3=episodes.channels_B3,
-        drawn_BF=drawn_BF,
-        times_BF=first + drawn_BF,
-    )
-
-
 def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
-    """Run or continue stage 2; writes `out`/checkpoint, a whole model, and returns its figures on all of `val`.
+    """Run or continue stage 2; writes `out`/checkpoint, a whole model.
 
-    Instruction following can be measured with masks, questions and explicit slots; slot errors always. The figures are
-    None on all processes but the main one.
+    Returns:
+        figures of all held-out episodes: instruction following, or slot errors where that cannot be measured. None on
+        all processes but the main one.
 
     Raises:
         CheckpointError: if `parser` is no checkpoint.
@@ -214,8 +135,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     """
     accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
-    with resolve_checkpoint(str(args.parser)) as folder:
-        trained = TextOCVP.from_pretrained(folder)
+    trained = TextOCVP.from_pretrained(str(args.parser))
     with open_data(args, trained.config.parser.image_size, "parser.image_size") as (episodes, held_out):
         model = assemble(args, trained, episodes.instructions, episodes.vocabulary).to(accelerator.device)
         layout, causal = model.config.parser.layout, model.config.predictor.causal
@@ -223,33 +143,53 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
         slots = cached_slots(model, episodes, args.out / "slots-train", *share)
         val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
         accelerator.wait_for_everyone()
-        batches = SlotBatches(
-            slots,
-            layout,
-            model.text,
-            # One frame more than the past, so that every time code gets trained.
-            model.config.predictor.window + 1 if causal else int(slots.lengths.max()),
-            recolor=args.recolor,
-            color_jitter=args.color_jitter,
-            place_jitter=args.place_jitter,
-        )
-        held = HeldOut.of(held_out, val_slots, layout, batches.frames)
-        std_C = content_units(model, batches, keep=args.finetune)
+        # One frame more than the past, so that every time code gets trained.
+        frames = model.config.predictor.window + 1 if causal else int(slots.lengths.max())
+        batches = SlotBatches(slots, layout, model.text, frames)
+        std_C = model.predictor.content_std_C if model.predictor.standardized else None
+        if (
+            std_C is not None and not args.finetune
+        ):  # which keeps the units in which the predictor was trained
+            mean_C, deviation_C = batches.content_statistics()
+            model.predictor.content_mean_C.copy_(mean_C)
+            std_C.copy_(deviation_C)
+        held = HeldOut.of(held_out, val_slots, layout, frames)
+        measure = partial(held.measure, model)
         run = Run(args, accelerator, PredictorStage(model))
+
         for step in run.steps("predictor"):
-            batch = draw_batch(args, batches, causal, step)[run.rows].to(run.device)
-            for part in run.micro_batches():
-                rows = batch[part]
-                predicted_BSKD = run.module(rows.given_BTKD, rows.words, rows.imagined).float()
-                loss = slot_loss(predicted_BSKD, rows.target_BSKD, rows.weights_BSK, layout, std_C, whole=1.0)
+            # Every process draws the whole batch, and then computes its rows of it.
+            rng = step_rng(args.seed, step)
+            batch = batches.draw(rng, args.batch)
+            given, imagined = schedule(args, causal, step, frames, rng)
+            given_BTKD = batches.noisy(rng, batch.slots_BTKD[:, :given])
+            rng.random(args.batch)  # unused; without it a seed would give other runs than it always did
+            # The causal form predicts from every frame the next, the window form only new frames.
+            first, last = 1 if causal else given, given + imagined  # numbers of the frames that are predicted
+            drawn_BF = rng.integers(last + 1 - first, size=(args.batch, args.image_frames))
+            true_BTKD = batch.slots_BTKD[:, first - 1 : last + 1]
+            weights_BSK = moving_weights(true_BTKD, layout, args.moving, ever=imagined > 0)
+            weights_BSK = weights_BSK / weights_BSK.sum().clamp(min=1e-6)
+
+            for rows in run.micro_batches(of_batch=True):
+                slots_BTKD, target_BSKD, weights = (
+                    whole[rows].to(run.device) for whole in (given_BTKD, true_BTKD[:, 1:], weights_BSK)
+                )
+                words = batch.words.select(rows).to(run.device)
+                predicted_BSKD = run.module(slots_BTKD, words, imagined).float()
+                loss = slot_loss(predicted_BSKD, target_BSKD, weights, layout, std_C)
                 total = loss.total(args.scale_weight, args.content_weight)
                 if args.image_weight > 0:
-                    image = drawn_loss(model, episodes, rows, predicted_BSKD)
-                    total = total + args.image_weight * run.weight(part) * image
-                run.backward(total, loss.as_metrics())
-            run.update(step, {"horizon": 1.0 + batch.imagined})
-            run.evaluate(step, partial(held.measure, model))
-        metrics = run.finish(model.save_pretrained, partial(held.measure, model), held.file)
+                    times_BF = first + drawn_BF[rows]
+                    true_BF3HW = true_frames(
+                        episodes, batch.episodes_B[rows], times_BF, batch.channels_B3[rows]
+                    )
+                    image = drawn_loss(model.renderer, predicted_BSKD, drawn_BF[rows], true_BF3HW)
+                    total = total + args.image_weight * run.weight(rows) * image
+                run.backward(total, vars(loss))
+            run.update(step, {"horizon": 1.0 + imagined})
+            run.evaluate(step, measure)
+        metrics = run.finish(model.save_pretrained, measure, held.file)
     close_run(accelerator)
     return metrics
 
@@ -265,80 +205,52 @@ def assemble(
         vocabulary: further words that a new text encoder must have a place for.
 
     Raises:
-        SettingsError: if an option would change the architecture of what is to be fine-tuned (but for a longer window),
-            or of the parser.
+        SettingsError: if an option would change the architecture of the parser, or of what is fine-tuned (but for a
+            longer window).
     """
+    config = trained.config
     if args.finetune:
         if args.preset is not None:
             raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
-        if trained.config.stage == "parser":
+        if config.stage == "parser":
             raise SettingsError(f"{args.parser} has no trained predictor to finetune: leave out finetune")
+        model = trained
         with allowed_settings():
-            extend_window(trained, args.set)
-        if isinstance(trained.config.text, WordsConfig):
+            extend_window(model, args.set)
+        if isinstance(config.text, WordsConfig):
             met = words_of(captions)  # and so trained from now on
-            left = tuple(word for word in trained.config.text.untrained if word not in met)
-            trained.text.config = replace(trained.config.text, untrained=left)
-            trained.config = replace(trained.config, text=trained.text.config)
-        trained.text.train()
-        trained.predictor.train()
-        for part in (trained.parser, trained.renderer):
-            part.requires_grad_(False)
-        return trained
-    config = trained.config
-    if args.preset is not None:
-        chosen = preset(args.preset)
-        config = replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
-    for setting in args.set:
-        if not setting.startswith(("predictor.", "text.")):
-            raise SettingsError(
-                f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
-            )
-    with allowed_settings():
-        config = with_settings(config, args.set)
-        text = config.text.for_captions(captions, vocabulary)
-        model = TextOCVP(replace(config, text=text, stage="predictor"))
-    for part, source in ((model.parser, trained.parser), (model.renderer, trained.renderer)):
-        part.load_state_dict(source.state_dict())
+            left = tuple(word for word in config.text.untrained if word not in met)
+            model.text.config = replace(config.text, untrained=left)
+            model.config = replace(model.config, text=model.text.config)
+        model.text.train()
+        model.predictor.train()
+    else:
+        if args.preset is not None:
+            chosen = preset(args.preset)
+            config = replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
+        for setting in args.set:
+            if not setting.startswith(("predictor.", "text.")):
+                raise SettingsError(
+                    f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
+                )
+        with allowed_settings():
+            config = with_settings(config, args.set)
+            text = config.text.for_captions(captions, vocabulary)
+            model = TextOCVP(replace(config, text=text, stage="predictor"))
+        model.parser.load_state_dict(trained.parser.state_dict())
+        model.renderer.load_state_dict(trained.renderer.state_dict())
+    for part in (model.parser, model.renderer):
         part.requires_grad_(False).eval()
     return model
-
-
-def content_units(model: TextOCVP, batches: SlotBatches, *, keep: bool) -> Tensor | None:
-    """The deviation (C,) of the content of slots, in which a predictor that standardises computes; None for others.
-
-    Args:
-        keep: leave the units in which a predictor was trained as they are.
-    """
-    if not model.predictor.standardized:
-        return None
-    if not keep:
-        mean_C, std_C = batches.content_statistics()
-        model.predictor.content_mean_C.copy_(mean_C)
-        model.predictor.content_std_C.copy_(std_C)
-    return model.predictor.content_std_C
-
-
-def drawn_loss(model: TextOCVP, episodes: Episodes, batch: StepBatch, predicted_BSKD: Tensor) -> Tensor:
-    """Mean squared error of the frames that `batch` wants drawn; its gradient flows through the frozen renderer."""
-    chosen_BF = torch.from_numpy(batch.drawn_BF).to(predicted_BSKD.device)
-    slots_BFKD = predicted_BSKD[torch.arange(len(chosen_BF))[:, None], chosen_BF]
-    true_BF3HW = true_frames(episodes, batch.episodes_B, batch.times_BF, batch.channels_B3)
-    frames = model.renderer(slots_BFKD.flatten(0, 1)).frames_B3HW
-    return (frames - true_BF3HW.to(frames.device).flatten(0, 1)).square().mean()
 
 
 def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
     """Let the predictor take more frames, as `predictor.window=FRAMES` says; within the old window it stays as it is.
 
-    The learned time codes of the new frames start as copies of the last one that training reached, so that the first
-    guess for frame 25 is what was learned about frame 24.
-
     Raises:
         ValueError: if a setting is another one, makes no sense, or would shorten the window.
     """
-    settings = tuple(settings)
-    for setting in settings:
+    for setting in (settings := tuple(settings)):
         if not setting.startswith("predictor.window="):
             raise ValueError(
                 f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow"
@@ -350,11 +262,13 @@ def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
             f"the window can grow, not shrink: it is {old.window} frames, {new.window} were asked for"
         )
     model.config, predictor.config = config, new
-    rows = new.time_codes
     if new.age_encoding == "learned":
-        # The published form has one code more than its window has frames: no training ever reached that one.
+        # The codes of new frames start as the last one that training reached. The published form has one code more
+        # than its window has frames: no training ever reached that one.
         reached = predictor.ages.detach()[: old.window]
-        predictor.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(rows - old.window, -1)]))
+        predictor.ages = nn.Parameter(
+            torch.cat([reached, reached[-1:].expand(new.time_codes - old.window, -1)])
+        )
     else:
-        codes = sinusoids(rows, new.dim).to(predictor.ages.device)
+        codes = sinusoids(new.time_codes, new.dim).to(predictor.ages.device)
         predictor.register_buffer("ages", codes, persistent=False)

@@ -1,11 +1,10 @@
 """What all stages of training share: settings, data, held-out figures, and a run of updates on one process or many.
 
-A run's folder holds `state/` (everything needed to continue exactly: weights, optimiser, schedule, random numbers and
-the number of the next step), `logs/` (TensorBoard) and whatever the stage writes for people and for the next stage.
+A run's folder holds `state/` (all that is needed to continue exactly), `logs/` (TensorBoard) and what the stage writes.
 
-Whatever is random in an update is a function of (seed, step) alone, and every process knows the whole batch's: each
-computes its rows of it, in as many micro-batches as its memory needs, whose losses add up to that of the batch. So a
-run is the same run on one process or on many, in one micro-batch or in many, stopped and continued or not.
+Whatever is random in an update is a function of (seed, step) alone. Each process computes its rows of the batch, in
+micro-batches whose losses add up to that of the batch. So a run is the same run on one process or on many, in one
+micro-batch or in many, stopped and continued or not.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import KW_ONLY, asdict, dataclass, fields
+from dataclasses import KW_ONLY, asdict, dataclass
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -51,15 +50,11 @@ class SettingsError(ValueError):
 
 @contextmanager
 def allowed_settings() -> Iterator[None]:
-    """For building a model: parts that do not fit each other are the settings' fault.
-
-    Raises:
-        SettingsError: for a ValueError that is no more special than that.
-    """
+    """For building a model: a plain ValueError, of parts that do not fit each other, becomes a SettingsError."""
     try:
         yield
     except ValueError as error:
-        if type(error) is not ValueError:
+        if type(error) is not ValueError:  # missing weights, for example
             raise
         raise SettingsError(str(error)) from error
 
@@ -105,9 +100,10 @@ class TrainingSettings:
 
 @contextmanager
 def open_data(args: TrainingSettings, image_size: int, setting: str) -> Iterator[tuple[Episodes, Episodes]]:
-    """The training episodes and the held-out ones, for a model that reads frames of `image_size` pixels.
+    """The training episodes and the held-out ones.
 
     Args:
+        image_size: of the frames that the model reads, in pixels.
         setting: what that size is called in the model's configuration.
 
     Raises:
@@ -125,27 +121,22 @@ def open_data(args: TrainingSettings, image_size: int, setting: str) -> Iterator
 
 
 class Metrics:
-    """Figures of held-out episodes. Subclasses are frozen dataclasses of numbers, intervals, and None for the rest."""
+    """Figures of held-out episodes. Subclasses are frozen dataclasses of numbers and intervals; None: not measured."""
 
     group: ClassVar[str] = "val"
     """What they are listed under in a log."""
 
     def measured(self) -> dict[str, Any]:
-        """What was measured: the fields that are numbers or intervals."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        return {
-            name: value for name, value in values.items() if value is not None and not isinstance(value, str)
-        }
+        """The fields that are numbers or intervals."""
+        return {name: value for name, value in vars(self).items() if not isinstance(value, str | None)}
 
     def as_metrics(self) -> dict[str, float]:
         """What was measured, without intervals, named for a log."""
-        return {
-            f"{self.group}/{name}": float(getattr(value, "value", value))
-            for name, value in self.measured().items()
-        }
+        measured = self.measured().items()
+        return {f"{self.group}/{name}": float(getattr(value, "value", value)) for name, value in measured}
 
     def to_json(self) -> str:
-        """All fields."""
+        """All fields, intervals with their bounds."""
         return json.dumps(asdict(self), indent=2) + "\n"  # type: ignore[call-overload]
 
 
@@ -157,8 +148,6 @@ def open_run(
 ) -> Accelerator:
     """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
 
-    Makes the folder, so that an unwritable one fails before any work.
-
     Args:
         some_unused: some parameters of what is trained take no part in an update.
 
@@ -167,7 +156,7 @@ def open_run(
     """
     if precision == "fp16" and not torch.cuda.is_available():
         raise SettingsError("precision fp16 needs a GPU, and there is none here: use bf16 or no")
-    (out / "logs").mkdir(parents=True, exist_ok=True)
+    (out / "logs").mkdir(parents=True, exist_ok=True)  # an unwritable folder fails before any work
     torch.set_flush_denormal(True)  # decaying Adam moments reach denormals, which are slow on CPUs
     # Without this, several processes without a GPU would each believe to be alone.
     only_cpus = int(os.environ.get("WORLD_SIZE", 1)) > 1 and not torch.cuda.is_available()
@@ -184,13 +173,12 @@ def open_run(
         ],
     )
     if accelerator.num_processes > 1:
-        atexit.register(destroy_group)
+        atexit.register(_destroy_group)
     accelerator.init_trackers("training")
     return accelerator
 
 
-def destroy_group() -> None:
-    """Leave the group of processes, if there is one."""
+def _destroy_group() -> None:
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
@@ -215,7 +203,7 @@ class Run:
     A training loop is
 
         for step in run.steps("predictor"):
-            rows = ...                                  # draw the whole batch, keep the rows `run.rows`
+            ...                                         # what the rows `run.rows` of the batch learn from
             for part in run.micro_batches():
                 run.backward(...)                       # what the rows `part` of these add to the loss of the batch
             run.update(step)
@@ -223,10 +211,10 @@ class Run:
     Args:
         args: the stage's settings.
         accelerator: from `open_run`.
-        module: what is trained. Gradients of several processes meet only if the loss comes from calling `run.module`.
+        module: what is trained.
 
     Attributes:
-        module: call this one.
+        module: the same for calling: else gradients of several processes do not meet.
         first: number of the first step that is left to do.
         rows: the rows of every batch that this process computes.
 
@@ -244,8 +232,7 @@ class Run:
         self.args, self.accelerator = args, accelerator
         edges = [args.batch * number // count for number in range(count + 1)]
         mine = edges[accelerator.process_index * args.accumulate :][: args.accumulate + 1]
-        self.rows = slice(mine[0], mine[-1])
-        self._micro_batches = [slice(a - mine[0], b - mine[0]) for a, b in pairwise(mine)]
+        self.rows, self._edges = slice(mine[0], mine[-1]), mine
         learned = [parameter for parameter in module.parameters() if parameter.requires_grad]
         optimizer = torch.optim.Adam(learned, lr=args.learning_rate)
         schedule = get_cosine_schedule_with_warmup(optimizer, args.warmup, args.steps)
@@ -264,11 +251,6 @@ class Run:
         """Where this process computes."""
         return self.accelerator.device
 
-    @property
-    def is_main(self) -> bool:
-        """Whether this process is the one that measures, draws and writes."""
-        return self.accelerator.is_main_process
-
     def steps(self, name: str) -> Iterator[int]:
         """The numbers of the steps that are left. Saves the state when it is time to, and at the end.
 
@@ -277,9 +259,8 @@ class Run:
         Args:
             name: of the progress bar.
         """
-        left = range(self.first, self.args.steps)
-        settings = dict(initial=self.first, total=self.args.steps, desc=name, unit="step")
-        self._bar = tqdm(left, disable=not self.is_main, **settings)
+        first, total, hidden = self.first, self.args.steps, not self.accelerator.is_main_process
+        self._bar = tqdm(range(first, total), name, initial=first, total=total, unit="step", disable=hidden)
         saved = time.monotonic()
         with _termination() as asked:
             for step in self._bar:
@@ -293,36 +274,31 @@ class Run:
                     raise SystemExit(128 + signal.SIGTERM)
         save_state(self.accelerator, self.args.out, self.args.steps)
 
-    def micro_batches(self) -> Iterator[slice]:
-        """Parts of this process's rows, counted from its first; each wants one `backward`."""
-        for number, part in enumerate(self._micro_batches):
-            last = number + 1 == len(self._micro_batches)
+    def micro_batches(self, *, of_batch: bool = False) -> Iterator[slice]:
+        """Parts of this process's rows; each wants one `backward`.
+
+        They are counted from this process's first row, or with `of_batch` from the first of the whole batch.
+        """
+        zero = 0 if of_batch else self.rows.start
+        for first, end in pairwise(self._edges):
             # Gradients travel between processes once an update.
+            last = end == self.rows.stop
             with nullcontext() if last else self.accelerator.no_sync(self.module):
-                yield part
+                yield slice(first - zero, end - zero)
 
     def weight(self, part: slice) -> float:
-        """How much of a batch the rows of `part` are: what a mean over them counts in that over the batch."""
+        """How much of a batch these rows are: what a mean over them counts in that over the batch."""
         return (part.stop - part.start) / self.args.batch
 
-    def backward(self, loss: Tensor, metrics: Mapping[str, Tensor] | None = None) -> None:
-        """Add the gradients of one micro-batch.
-
-        Args:
-            loss: what it adds to the loss of the batch.
-            metrics: for the log; like the loss they add up over the micro-batches.
-        """
+    def backward(self, loss: Tensor, terms: Mapping[str, Tensor] | None = None) -> None:
+        """Add the gradients of what a micro-batch adds to the loss of the batch; `terms` are for the log."""
         # Gradients are averaged over the processes; they are meant to add up.
         self.accelerator.backward(loss * self.accelerator.num_processes)
-        for name, value in {"loss/total": loss, **(metrics or {})}.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value.detach()
+        for name, value in {"total": loss, **(terms or {})}.items():
+            self._sums[f"loss/{name}"] = self._sums.get(f"loss/{name}", 0.0) + value.detach()
 
     def update(self, step: int, metrics: Mapping[str, float] | None = None) -> None:
-        """Take the step that the gradients ask for, and log now and then.
-
-        Args:
-            metrics: more for the log, which all processes agree on.
-        """
+        """Take the step that the gradients ask for, and log now and then, also `metrics`, equal on all processes."""
         norm = self.accelerator.clip_grad_norm_(self.module.parameters(), self.args.clip_norm)
         self._optimizer.step()
         self._schedule.step()
@@ -330,40 +306,30 @@ class Run:
         if step % LOG_EVERY == 0:
             sums = self.accelerator.reduce(self._sums, "sum")
             values = {name: float(value) for name, value in sums.items()}
-            self.log(step, {**values, "gradient_norm": float(norm), **(metrics or {})})
-            self._bar.set_postfix(
-                {name.removeprefix("loss/"): f"{value:.4f}" for name, value in values.items()}
-            )
+            self.accelerator.log({**values, "gradient_norm": float(norm), **(metrics or {})}, step)
+            self._bar.set_postfix({name.removeprefix("loss/"): f"{x:.4f}" for name, x in values.items()})
         self._sums = {}
-
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log metrics of a step; only the main process's count."""
-        self.accelerator.log(dict(metrics), step=step)
 
     def evaluate(
         self, step: int, measure: Callable[[int | None], Metrics], draw: Callable[[Path], None] | None = None
     ) -> None:
-        """Every so many updates, measure and log, on the main process.
+        """Every `args.evaluate_every` updates, on the main process.
 
         Args:
-            measure: the figures of the first so many held-out episodes.
-            draw: write a picture of a few of them.
+            measure: gives the figures of the first so many held-out episodes, or of all (None).
+            draw: writes a picture of a few of them.
         """
-        if not self.is_main or (step + 1) % self.args.evaluate_every:
+        if not self.accelerator.is_main_process or (step + 1) % self.args.evaluate_every:
             return
         metrics = measure(self.args.evaluate_episodes)
-        self.log(step, metrics.as_metrics())
+        self.accelerator.log(metrics.as_metrics(), step)
         tqdm.write(f"step {step + 1}: {metrics}")
         if draw is not None:
             draw(self.args.out / "samples" / f"{step + 1:06d}.png")
 
     def finish(self, save: Callable[[Path], Any], measure: Callable[[int | None], M], file: str) -> M | None:
-        """Write `out`/checkpoint, and measure on all held-out episodes into `out`/`file`; main process only.
-
-        Returns:
-            the figures; None on the other processes.
-        """
-        if not self.is_main:
+        """Write `out`/checkpoint, and the figures of all held-out episodes as `out`/`file`; None on other processes."""
+        if not self.accelerator.is_main_process:
             return None
         save(self.args.out / "checkpoint")
         metrics = measure(None)
@@ -386,11 +352,11 @@ class Run:
 
 @contextmanager
 def _termination() -> Iterator[list[int]]:
-    """Collects SIGTERM instead of dying of it. Only the main thread may: elsewhere nothing changes."""
+    """Collects SIGTERM instead of dying of it."""
     asked: list[int] = []
     try:
         before = signal.signal(signal.SIGTERM, lambda number, frame: asked.append(number))
-    except ValueError:
+    except ValueError:  # only the main thread may
         yield asked
         return
     try:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
+from textocvp.presets import TABLETOP_COLORS, TABLETOP_WORDS
 from textocvp.text import build_text_encoder
 from textocvp.text.base import TextEncoder
-from textocvp.text.words import COLOR, GRAMMAR, TABLEAU_10, TRAIN_COLORS, WordsConfig, palette
+from textocvp.text.words import COLOR, TABLEAU_10, WordsConfig, palette
 
 CAPTION = "put the red block in the gray bowl"
 
 
-WORDS = {"lexicon": GRAMMAR, "transformer": GRAMMAR + TRAIN_COLORS}
+WORDS = {"lexicon": TABLETOP_WORDS, "transformer": TABLETOP_WORDS + TABLETOP_COLORS}
 
 
 def encoder(kind: str, **changes: object) -> TextEncoder:
@@ -51,7 +52,7 @@ def test_unknown_words_are_named_once_and_in_order():
 
 
 def test_words_that_no_caption_contained_are_unknown_too():
-    config = WordsConfig(untrained=("move", "onto"), vocabulary=(*GRAMMAR, "onto"))
+    config = WordsConfig(untrained=("move", "onto"), vocabulary=(*TABLETOP_WORDS, "onto"))
     model = build_text_encoder(config)
     assert model.unknown_words("move the red block onto the blue bowl, move!") == ["move", "onto"]
     assert model.lookup(["move onto"]).ids_BL.tolist() == [[14, 18]]  # they have rows of their own
@@ -71,14 +72,27 @@ def test_the_vocabulary_is_in_the_configuration():
 
 
 def test_new_captions_bring_new_words_and_old_ones_keep_their_rows():
-    lexicon = WordsConfig().for_captions(["Stack the red block on the light block"])
-    assert lexicon.vocabulary == (*GRAMMAR, "light", "stack")  # red is in the palette
-    assert set(GRAMMAR) - set(lexicon.untrained) == {"the", "block", "on"}
-    words = WordsConfig(kind="transformer").for_captions([CAPTION], vocabulary=("under", "gray", "red"))
-    assert words.vocabulary == (*GRAMMAR, "red", "gray", "under")
-    assert {"under", "and"} < set(words.untrained) and not {"red", "gray", "put"} & set(words.untrained)
-    preset = WordsConfig(kind="transformer").for_captions(f"put the {c} block" for c in TRAIN_COLORS)
-    assert preset.vocabulary == WORDS["transformer"]
+    lexicon = WordsConfig(vocabulary=("the", "in", "red")).for_captions(
+        ["Stack the red block on the light block"]
+    )
+    assert lexicon.vocabulary == (
+        "the",
+        "in",
+        "red",
+        "block",
+        "light",
+        "on",
+        "stack",
+    )  # red has a row already
+    assert lexicon.untrained == ("in",)
+    lexicon = WordsConfig().for_captions(["put the red block"], vocabulary=("under", "gray", "put"))
+    assert lexicon.vocabulary == ("under", "put", "block", "the")  # red and gray are in the palette
+    words = WordsConfig("transformer", vocabulary=("in",)).for_captions(
+        [CAPTION], ("under", "gray", "red", "in", "a/b")
+    )
+    assert words.vocabulary == ("in", "under", "gray", "red", "block", "bowl", "put", "the")
+    assert words.untrained == ("under",)
+    assert WordsConfig().vocabulary == ()
 
 
 def test_colors_of_the_lexicon_differ_in_rgb_only():

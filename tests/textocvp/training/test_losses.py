@@ -45,8 +45,8 @@ def test_moving_slots_weigh_more_and_unused_ones_nothing():
 def test_loss_counts_each_field_in_its_own_unit():
     slots = true_slots(6)[:, :1]
     std, weight = torch.tensor([1.0, 2.0, 1.0, 1.0]), torch.zeros(12, 1, 5)
-    weight[:, :, 1] = 1.0
-    assert sum(slot_loss(slots, slots, weight, LAYOUT, std).as_metrics().values()) == 0
+    weight[:, :, 1] = 1 / 12
+    assert sum(vars(slot_loss(slots, slots, weight, LAYOUT, std)).values()) == 0
     state = SlotState.split(slots, LAYOUT)
     shifted = replace(state, position=state.position + torch.tensor([0.3, 0.0]))
     assert slot_loss(shifted.join(), slots, weight, LAYOUT, std).position.item() == pytest.approx(

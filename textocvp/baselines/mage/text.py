@@ -16,7 +16,7 @@ from textocvp.baselines.mage.layers import BiasedAttention, FeedForward
 from textocvp.layers import mask_bias
 from textocvp.text import ENCODERS
 from textocvp.text.base import TextEncoder, TextTokens, WordBatch
-from textocvp.text.words import GRAMMAR, PAD, TRAIN_COLORS, UNKNOWN, WordEncoder, WordsConfig
+from textocvp.text.words import PAD, UNKNOWN, WordEncoder, WordsConfig
 
 FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding: no word here stands for all colours
 
@@ -30,7 +30,6 @@ class PublishedTextConfig(WordsConfig):
     max_tokens: int = 32
     heads: int = 16
     hidden: int = 2048
-    vocabulary: tuple[str, ...] = GRAMMAR + TRAIN_COLORS
     rows: int = 30  # of the word embedding; as published more than there are words: the rest is never used
 
     def __post_init__(self) -> None:

@@ -115,7 +115,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
                 terms = (found.codebook_loss, found.commitment_loss)
                 codebook, commitment = (run.weight(part) * term for term in terms)
                 total = image + codebook + args.commitment * commitment
-                run.backward(total, {"loss/image": image, "loss/commitment": commitment})
+                run.backward(total, {"image": image, "commitment": commitment})
                 counts_K += found.codes_Nhw.flatten().bincount(minlength=len(counts_K))
             counts_K = run.total(counts_K).cpu()
             uses.counts_K += counts_K
