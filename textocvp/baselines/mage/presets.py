@@ -35,12 +35,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
 
 
 def mage_preset(name: str) -> MageConfig:
-    """The preset of that name.
-
-    Raises:
-        KeyError: if there is none; the message lists those that exist.
-    """
-    try:
-        return MAGE_PRESETS[name]
-    except KeyError:
-        raise KeyError(f"unknown MAGE preset {name!r}; known: {', '.join(sorted(MAGE_PRESETS))}") from None
+    """The preset of that name. The message of a KeyError lists those that exist."""
+    if name not in MAGE_PRESETS:
+        raise KeyError(f"unknown MAGE preset {name!r}; known: {', '.join(sorted(MAGE_PRESETS))}")
+    return MAGE_PRESETS[name]
