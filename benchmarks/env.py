@@ -1,10 +1,9 @@
 """Speed of the environment: ``python -m benchmarks.env``.
 
-CPU time of this one process, so that other work on the machine counts as little as possible. Beside our scene
-stands a CLIPort-like one: 480 physics steps a second, and an arm of as many triangles as detailed visual
-meshes of a UR5 have. Its shapes are made here, because no asset package is installed; its render time at
-64x64 was chosen to lie near the 26 ms that CLIPort's own meshes were measured to cost. Ratios are what
-carries over to other machines.
+CPU time of this one process, so that other work on the machine counts as little as possible. Beside our scene stands a
+CLIPort-like one: 480 physics steps a second, and an arm of as many triangles as the visual meshes of a UR5. Its shapes
+are made here, because no asset package is installed; `TRIANGLES` was chosen so that a render at 64x64 takes about the
+26 ms that CLIPort's own meshes were measured to cost. Ratios are what carries over to other machines.
 """
 
 from __future__ import annotations
@@ -23,11 +22,10 @@ import tyro
 
 import envs
 from envs.dataset import EpisodeConfig, collect
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data import open_episodes
 
 LINKS = 7
-TRIANGLES = 16_000
-"""Of one link of the CLIPort-like arm."""
+TRIANGLES = 16_000  # of one link of the CLIPort-like arm
 
 
 @dataclass(frozen=True)
@@ -45,16 +43,11 @@ class Speed:
     """CPU time of one way to run."""
 
     name: str
-    frame_ms: float
-    """One render: RGB, segmentation and depth."""
-    step_ms: float
-    """One physics step."""
-    reset_ms: float
-    """Building a scene."""
-    episode_s: float
-    """A whole expert episode: reset, and all its frames."""
-    frames: int
-    """Frames of an episode."""
+    frame_ms: float  # one render: RGB, segmentation and depth
+    step_ms: float  # one physics step
+    reset_ms: float  # building a scene
+    episode_s: float  # a whole expert episode: reset, and all its frames
+    frames: int  # of an episode
 
     def row(self) -> str:
         """A line of the table."""
@@ -84,8 +77,7 @@ def measure(name: str, size: int, hz: int, stride: int, episodes: int, meshes: P
         if seed > 0:  # the first one fills caches
             total += time.process_time() - begin + reset
             resets += reset
-    render = _mean_ms(world.render, 30)
-    step = _mean_ms(world.step, 200)
+    render, step = _mean_ms(world.render, 30), _mean_ms(world.step, 200)
     env.close()
     return Speed(name, render, step, 1e3 * resets / episodes, total / episodes, frames)
 
@@ -106,7 +98,7 @@ def _add_dense_arm(world: Any, mesh: Path) -> None:
     world._label = np.append(world._label, np.ones(LINKS, dtype=np.uint8))
 
 
-def write_dense_link(path: Path) -> None:
+def _write_dense_link(path: Path) -> None:
     """A tube of `TRIANGLES` triangles, 30 cm long."""
     rings, corners = 80, TRIANGLES // 160
     lines = [
@@ -124,12 +116,10 @@ def write_dense_link(path: Path) -> None:
 def clip_speed(folder: Path) -> float:
     """Frames a second of random clips of 6 frames, in batches of 64."""
     collect(EpisodeConfig("train"), 40, folder / "clips.h5")
-    with EpisodeFile(folder / "clips.h5") as file:
+    with open_episodes(folder / "clips.h5") as episodes:
         rng = np.random.default_rng(0)
-        begin = time.process_time()
-        for _ in range(10):
-            file.random_clips(rng, 64, 6)
-    return 10 * 64 * 6 / (time.process_time() - begin)
+        spent = _mean_ms(lambda: episodes.clips(episodes.random_starts(rng, 64, 6), 6), 10)
+    return 64 * 6 / (spent / 1e3)
 
 
 def main(args: Args) -> None:
@@ -137,7 +127,7 @@ def main(args: Args) -> None:
     with TemporaryDirectory() as name:
         folder = Path(name)
         mesh = folder / "link.obj"
-        write_dense_link(mesh)
+        _write_dense_link(mesh)
         print(
             f"{'CPU time':<28}{'ms/frame':>10}{'ms/step':>10}{'ms/reset':>10}{'s/episode':>12}{'frames':>8}"
         )

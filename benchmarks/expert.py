@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
 
 import gymnasium as gym
 import tyro
@@ -14,9 +13,9 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 import envs
+from textocvp.metrics import wilson_interval
 
-GROUP = 25
-"""Episodes that share an environment."""
+GROUP = 25  # episodes that share an environment
 
 
 @dataclass(frozen=True)
@@ -45,14 +44,6 @@ def play(control: str, seeds: range) -> list[bool]:
     return results
 
 
-def wilson(successes: int, total: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927): honest also near 0 and 1, where the usual one has no width."""
-    z, share = 1.96, successes / total
-    middle = (share + z * z / (2 * total)) / (1 + z * z / total)
-    half = z * sqrt(share * (1 - share) / total + z * z / (4 * total * total)) / (1 + z * z / total)
-    return middle - half, middle + half
-
-
 def main(args: Args) -> None:
     """Run and print."""
     print(f"{'control':<12}{'success':>14}{'share':>9}   95 % interval")
@@ -65,9 +56,9 @@ def main(args: Args) -> None:
             for group in run(jobs):
                 results += group
                 progress.update(len(group))
-        low, high = wilson(sum(results), len(results))
-        share = sum(results) / len(results)
-        print(f"{control:<12}{sum(results):>8}/{len(results):<5}{share:>9.2%}   {low:.2%} to {high:.2%}")
+        wins, total = sum(results), len(results)
+        share = wilson_interval(wins, total)
+        print(f"{control:<12}{wins:>8}/{total:<5}{share.value:>9.2%}   {share.low:.2%} to {share.high:.2%}")
         failed = [seed for seed, success in enumerate(results) if not success]
         if failed:
             print(f"  failed seeds: {failed}")

@@ -1,7 +1,5 @@
 """From imagined rollouts to robot actions: ground -> score -> plan -> act.
 
-    from planning import BeamPlanner, Goal, run_episode
-
     env = gym.make("PutBlockInBowl-v0", control="primitive")
     obs, info = env.reset(seed=0)
     planner = BeamPlanner(WorldModel.from_pretrained())
@@ -9,11 +7,10 @@
 
 Scoring rollouts without a robot:
 
-    instruction = Instruction.parse(text)                            # relation, thing, target
+    instruction = Instruction.parse(text)
     rollout = world_model.rollout(obs, [text] * n)
-    grounder = AppearanceGrounder.from_info(info)                    # camera and palette
-    trace = measure_rollout(rollout, grounder(rollout), instruction) # distances in pixels, (B, T)
-    success_B = SuccessCriterion()(trace)
+    grounding = AppearanceGrounder.from_info(info)(rollout)
+    success_B = SuccessCriterion()(measure_rollout(rollout, grounding, instruction))
 
 Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """

@@ -1,6 +1,4 @@
-"""A calibrated camera: the one thing, besides its own picture, that the planner knows about the robot's
-cell.
-"""
+"""A calibrated camera: all that the planner knows about the robot's cell, besides the camera's own picture."""
 
 from __future__ import annotations
 
@@ -18,46 +16,31 @@ Array = NDArray[np.float64]
 class PinholeCamera:
     """A pinhole camera with OpenCV axes (x right, y down, z forward).
 
-    Pixels are (x, y); the centre of the top-left pixel is (0.5, 0.5). World points are in metres, z up.
-
-    Attributes:
-        intrinsics: (3, 3), in pixels.
-        extrinsics: (4, 4), world to camera, in metres.
+    Pixels are (x, y); the centre of the top-left pixel is (0.5, 0.5). World points are in metres, z up from the table.
     """
 
-    intrinsics: Array
-    extrinsics: Array
+    intrinsics: Array  # (3, 3), in pixels
+    extrinsics: Array  # (4, 4), world to camera, in metres
 
     def __post_init__(self) -> None:
-        if np.shape(self.intrinsics) != (3, 3) or np.shape(self.extrinsics) != (4, 4):
-            raise ValueError(
-                f"intrinsics must be (3, 3) and extrinsics (4, 4), "
-                f"got {np.shape(self.intrinsics)} and {np.shape(self.extrinsics)}"
-            )
+        inner, outer = np.shape(self.intrinsics), np.shape(self.extrinsics)
+        if (inner, outer) != ((3, 3), (4, 4)):
+            raise ValueError(f"intrinsics must be (3, 3) and extrinsics (4, 4), got {inner} and {outer}")
 
     @classmethod
     def from_info(cls, camera: Mapping[str, Any]) -> PinholeCamera:
         """From `info["camera"]` of the environments, which has `intrinsics` and `extrinsics`."""
-        return cls(
-            np.asarray(camera["intrinsics"], dtype=np.float64),
-            np.asarray(camera["extrinsics"], dtype=np.float64),
-        )
+        return cls(*(np.asarray(camera[name], dtype=np.float64) for name in ("intrinsics", "extrinsics")))
 
     def project(self, points: ArrayLike) -> Array:
-        """World points (..., 3) in metres -> pixels (..., 2)."""
+        """World points (..., 3) to pixels (..., 2)."""
         points = np.asarray(points, dtype=np.float64)
         in_camera = points @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
         homogeneous = in_camera @ self.intrinsics.T
         return homogeneous[..., :2] / homogeneous[..., 2:]
 
-    def depth(self, points: ArrayLike) -> Array:
-        """Distance of world points (..., 3) along the optical axis, (...) in metres."""
-        points = np.asarray(points, dtype=np.float64)
-        return points @ self.extrinsics[2, :3] + self.extrinsics[2, 3]
-
     def unproject_to_plane(self, pixels: ArrayLike, z: float) -> Array:
-        """Pixels (..., 2) -> the world points (..., 3) in metres that they show at height `z` above the
-        table.
+        """The world points (..., 3) that pixels (..., 2) show at height `z`.
 
         Raises:
             ValueError: if a pixel's ray does not meet that plane in front of the camera.
@@ -74,8 +57,6 @@ class PinholeCamera:
         return center + reach * rays
 
     def metres_per_pixel(self, pixels: ArrayLike, z: float) -> Array:
-        """How many metres one pixel spans across the line of sight, where pixels (..., 2) show height `z`:
-        (...).
-        """
-        focal = float(self.intrinsics[0, 0])
-        return self.depth(self.unproject_to_plane(pixels, z)) / focal
+        """Metres (...) that one pixel spans across the line of sight, where pixels (..., 2) show height `z`."""
+        depth = self.unproject_to_plane(pixels, z) @ self.extrinsics[2, :3] + self.extrinsics[2, 3]
+        return depth / float(self.intrinsics[0, 0])

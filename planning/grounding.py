@@ -1,8 +1,7 @@
 """Which slot is what, in the first frame of a rollout.
 
-`ground` goes by how the slots look, and learns nothing: it compares a slot's colour with a palette, and turns its
-apparent size into metres through the camera. `ground_by_segmentation` reads the simulator's truth; it is for studies
-and for the control column `privileged`, never for the planner proper.
+`ground` goes by how slots look, and learns nothing. `ground_by_segmentation` reads the simulator's truth: it is for
+studies and for the control column `privileged`, never for the planner proper.
 """
 
 from __future__ import annotations
@@ -18,34 +17,30 @@ from scipy.optimize import linear_sum_assignment
 
 from planning.camera import PinholeCamera
 from planning.language import Instruction, Thing
-from planning.masks import hard_masks
+from planning.masks import Bools, frame_masks
 from planning.relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
 RGB = tuple[float, float, float]
+Integers = NDArray[np.integer[Any]]
+Floats = NDArray[np.floating[Any]]
 
-#: A surface shows its colour times the light on it, which lies between these in the tabletop scenes.
+# A surface shows its colour times the light on it, which lies between these in the tabletop scenes.
 LIGHT = (0.7, 1.05)
-
-#: To get a name that is not its nearest, a slot may be at most this far from it (Euclidean, RGB 0..1).
+# To get a name that is not its nearest, a slot may be at most this far from it (Euclidean, RGB 0..1).
 SECOND_CHOICE = 0.25
-
-#: A slot must be present this much, and win this many pixels, to be looked at.
+# A slot must be present this much, and win this many pixels, to be looked at.
 MIN_PRESENCE, MIN_PIXELS = 0.5, 6
-
-#: Slots of one colour name belong to one object when their pixels are at most this far apart.
+# Slots of one colour name belong to one object when their pixels are at most this far apart.
 TOUCH_PX = 2
-
-#: What looks wider than this, in metres, is a bowl. In the first and last frames of 200 val episodes blocks look
-#: 0.054 to 0.076 wide and bowls 0.115 to 0.149 (`experiments/calibrate.py`).
+# What looks wider than this, in metres, is a bowl. In the first and last frames of 200 val episodes blocks look
+# 0.054 to 0.076 wide and bowls 0.115 to 0.149 (`experiments/calibrate.py`).
 BOWL_WIDTH = 0.095
-
-#: Height above the table, in metres, at which apparent sizes are measured.
+# Height above the table, in metres, at which apparent sizes are measured.
 MIDDLE_HEIGHT = 0.03
-
-#: Labels in a segmentation of what is no object.
+# Labels in a segmentation of what is no object.
 BACKGROUND, ROBOT = 0, 1
 
 
@@ -64,30 +59,22 @@ class Palette:
     @classmethod
     def from_info(cls, palette: Mapping[str, Any]) -> Palette:
         """From `info["palette"]` of the environments, RGB 0..255."""
-        return cls(
-            {name: _unit(color) for name, color in palette["colors"].items()},
-            _unit(palette["robot"]),
-            _unit(palette["table"]),
-        )
 
+        def unit(color: Sequence[float]) -> RGB:
+            red, green, blue = color
+            return red / 255, green / 255, blue / 255
 
-def _unit(color: Sequence[float]) -> RGB:
-    red, green, blue = color
-    return red / 255, green / 255, blue / 255
+        colors = {name: unit(color) for name, color in palette["colors"].items()}
+        return cls(colors, unit(palette["robot"]), unit(palette["table"]))
 
 
 @dataclass(frozen=True)
 class Grounding:
-    """Which slots of one scene are what. Slots keep their index, so this holds for all frames of a rollout.
+    """Which slots of one scene are what. Slots keep their index, so this holds for all frames of a rollout."""
 
-    Attributes:
-        background: slots that show table and floor.
-        arm: slots that show the robot (their union is the arm).
-        things: the slots of every named object, usually one; two where a lit and a shaded side were parsed apart.
-    """
-
-    background: tuple[int, ...]
+    background: tuple[int, ...]  # table and floor
     arm: tuple[int, ...]
+    # Usually one slot; two where a lit and a shaded side were parsed apart.
     things: Mapping[Thing, tuple[int, ...]] = field(default_factory=dict)
 
     def of_kind(self, kind: str) -> tuple[Thing, ...]:
@@ -117,34 +104,30 @@ class Grounding:
         return self.things[thing]
 
     def with_kinds(self, things: Iterable[Thing]) -> Grounding:
-        """This grounding, with the kinds of these things taken from language.
-
-        A goal that names the red block says that what looks red is a block: no two objects of a scene share a
-        colour. Colours that the scene does not show are left out.
-        """
+        """This grounding, with the kinds that language gives these things; those that are not seen are ignored."""
+        # A goal that names the red block says that what looks red is a block: no two objects share a colour.
         kinds = {thing.color: thing.kind for thing in things}
-        renamed = {
-            Thing(seen.color, kinds.get(seen.color, seen.kind)): slots for seen, slots in self.things.items()
-        }
+        seen = self.things.items()
+        renamed = {Thing(one.color, kinds.get(one.color, one.kind)): slots for one, slots in seen}
         return replace(self, things=renamed)
 
 
 class Grounder(Protocol):
-    """Anything that grounds the first frame of one parsed scene (B = 1)."""
+    """Grounds the first frame of one parsed scene (B = 1)."""
 
     def __call__(self, parsed: Rollout) -> Grounding: ...
 
 
 @dataclass(frozen=True)
 class AppearanceGrounder:
-    """`ground` for one scene, with its camera and palette bound."""
+    """`ground` with the camera and palette of a scene."""
 
     camera: PinholeCamera
     palette: Palette
 
     @classmethod
     def from_info(cls, info: Mapping[str, Any]) -> AppearanceGrounder:
-        """From the `info` of the environments, of which it reads `camera` and `palette`."""
+        """From `camera` and `palette` of the environments' `info`."""
         return cls(PinholeCamera.from_info(info["camera"]), Palette.from_info(info["palette"]))
 
     def __call__(self, parsed: Rollout) -> Grounding:
@@ -153,14 +136,14 @@ class AppearanceGrounder:
 
 @dataclass(frozen=True, eq=False)
 class SegmentationGrounder:
-    """`ground_by_segmentation` for one scene, with its truth bound."""
+    """`ground_by_segmentation` with the truth of a scene."""
 
-    segmentation: NDArray[np.integer[Any]]
+    segmentation: Integers
     objects: Sequence[Mapping[str, Any]]
 
     @classmethod
     def from_info(cls, info: Mapping[str, Any]) -> SegmentationGrounder:
-        """From the `info` of the environments, of which it reads `segmentation` and `objects`."""
+        """From `segmentation` and `objects` of the environments' `info`."""
         return cls(info["segmentation"], info["objects"])
 
     def __call__(self, parsed: Rollout) -> Grounding:
@@ -170,65 +153,48 @@ class SegmentationGrounder:
 def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette) -> list[Grounding]:
     """Ground the first frame of every rollout of a batch by appearance: B groundings.
 
-    Colours: each slot takes the nearest name, whatever the light. Slots of one name that touch are one object, and no
-    two objects share a name (Hungarian). Kind: by apparent width in metres.
+    Each slot takes the nearest colour's name, whatever the light. Slots of one name that touch are one object, and no
+    two objects share a name (Hungarian). Its apparent width in metres says of what kind it is.
     """
-    masks_BKHW = hard_masks(rollout.decode_masks([0])[:, 0]).cpu().numpy()
-    colors_BK3 = rollout.colors[:, 0].cpu().numpy()
-    present_BK = rollout.presence[:, 0].cpu().numpy() >= MIN_PRESENCE
-    return [
-        _ground_scene(masks, colors, present, camera, palette)
-        for masks, colors, present in zip(masks_BKHW, colors_BK3, present_BK, strict=True)
-    ]
+    colors_BK3, presence_BK = (values[:, 0].cpu().numpy() for values in (rollout.colors, rollout.presence))
+    scenes = zip(frame_masks(rollout, 0), colors_BK3, presence_BK >= MIN_PRESENCE, strict=True)
+    return [_ground_scene(*scene, camera, palette) for scene in scenes]
 
 
 def _ground_scene(
-    masks_KHW: NDArray[np.bool_],
-    colors_K3: NDArray[np.floating],
-    present_K: NDArray[np.bool_],
-    camera: PinholeCamera,
-    palette: Palette,
+    masks_KHW: Bools, colors_K3: Floats, present_K: Bools, camera: PinholeCamera, palette: Palette
 ) -> Grounding:
     area_K = masks_KHW.sum((1, 2))
-    background, arm = [int(area_K.argmax())], []
+    largest = int(area_K.argmax())
     names = list(palette.colors)
     looks = [*palette.colors.values(), palette.robot, palette.table]
     cost_KN = np.stack([color_distance(colors_K3, color) for color in looks], axis=1)
     nearest_K = cost_KN.argmin(1)
-    named: list[int] = []
-    for slot in np.flatnonzero(present_K & (area_K >= MIN_PIXELS)).tolist():
-        if slot == background[0]:
-            continue
-        if nearest_K[slot] == len(names):
-            arm.append(slot)
-        elif nearest_K[slot] > len(names):
-            background.append(slot)
-        else:
-            named.append(slot)
-    groups = _merge_touching(named, nearest_K, masks_KHW)
+    slots = [k for k in np.flatnonzero(present_K & (area_K >= MIN_PIXELS)).tolist() if k != largest]
+    background = (largest, *(k for k in slots if nearest_K[k] > len(names)))
+    arm = tuple(k for k in slots if nearest_K[k] == len(names))
+    groups = _merge_touching([k for k in slots if nearest_K[k] < len(names)], nearest_K, masks_KHW)
     if not groups:
-        return Grounding(tuple(background), tuple(arm))
+        return Grounding(background, arm)
     area_G = np.array([area_K[group].sum() for group in groups])
-    cost_GN = np.array(
-        [np.average(cost_KN[group, : len(names)], axis=0, weights=area_K[group]) for group in groups]
-    )
+    cost_GN = np.array([np.average(cost_KN[g, : len(names)], axis=0, weights=area_K[g]) for g in groups])
     things = {}
     # Weighted by area, so that a stray fragment never takes a name away.
     for g, n in zip(*linear_sum_assignment(cost_GN * area_G[:, None]), strict=True):
         if n == cost_GN[g].argmin() or cost_GN[g, n] <= SECOND_CHOICE:
             width = apparent_width(np.any(masks_KHW[groups[g]], axis=0), camera)
             things[Thing(names[n], "bowl" if width > BOWL_WIDTH else "block")] = tuple(groups[g])
-    return Grounding(tuple(background), tuple(arm), things)
+    return Grounding(background, arm, things)
 
 
-def color_distance(colors_N3: NDArray[np.floating], color: Sequence[float]) -> NDArray[np.floating]:
+def color_distance(colors_N3: Floats, color: Sequence[float]) -> Floats:
     """Distance (N,) of seen colours (N, 3) to a named one (3,), RGB 0..1, under the light that suits it best."""
     reference_3 = np.asarray(color)
     light_N = np.clip(colors_N3 @ reference_3 / (reference_3 @ reference_3), *LIGHT)
     return np.linalg.norm(colors_N3 - light_N[:, None] * reference_3, axis=1)
 
 
-def apparent_width(mask_HW: NDArray[np.bool_], camera: PinholeCamera) -> float:
+def apparent_width(mask_HW: Bools, camera: PinholeCamera) -> float:
     """Width in metres, across the line of sight, of the upright box that spreads its pixels as this mask does."""
     y, x = np.nonzero(mask_HW)
     center = np.array([x.mean() + 0.5, y.mean() + 0.5])
@@ -236,9 +202,7 @@ def apparent_width(mask_HW: NDArray[np.bool_], camera: PinholeCamera) -> float:
     return float(12**0.5 * x.std() * camera.metres_per_pixel(center, MIDDLE_HEIGHT))
 
 
-def _merge_touching(
-    slots: Sequence[int], name_K: NDArray[np.integer], masks_KHW: NDArray[np.bool_]
-) -> list[list[int]]:
+def _merge_touching(slots: Sequence[int], name_K: Integers, masks_KHW: Bools) -> list[list[int]]:
     groups: list[list[int]] = []
     for slot in slots:
         near = binary_dilation(masks_KHW[slot], np.ones((3, 3)), iterations=TOUCH_PX)
@@ -249,7 +213,7 @@ def _merge_touching(
 
 
 def ground_by_segmentation(
-    rollout: Rollout, segmentation: NDArray[np.integer[Any]], objects: Sequence[Mapping[str, Any]]
+    rollout: Rollout, segmentation: Integers, objects: Sequence[Mapping[str, Any]]
 ) -> list[Grounding]:
     """Ground the first frame of every rollout by mask overlap with the true segmentation (Hungarian): B groundings.
 
@@ -260,7 +224,7 @@ def ground_by_segmentation(
     Raises:
         ValueError: if the segmentation does not have the rollout's size.
     """
-    masks_BKHW = hard_masks(rollout.decode_masks([0])[:, 0]).cpu().numpy()
+    masks_BKHW = frame_masks(rollout, 0)
     truth_BHW = np.broadcast_to(segmentation, (len(masks_BKHW), *np.shape(segmentation)[-2:]))
     if truth_BHW.shape[1:] != masks_BKHW.shape[2:]:
         raise ValueError(
@@ -270,22 +234,21 @@ def ground_by_segmentation(
     groundings = []
     for masks_KHW, truth_HW in zip(masks_BKHW, truth_BHW, strict=True):
         slots = _slots_of_labels(masks_KHW, truth_HW, labels)
-        things = {Thing(item["color"], item["kind"]): slots[item["label"]] for item in objects}
-        seen = {thing: its for thing, its in things.items() if its}
-        groundings.append(Grounding(slots[BACKGROUND], slots[ROBOT], seen))
+        seen = [item for item in objects if slots[item["label"]]]
+        things = {Thing(item["color"], item["kind"]): slots[item["label"]] for item in seen}
+        groundings.append(Grounding(slots[BACKGROUND], slots[ROBOT], things))
     return groundings
 
 
 def _slots_of_labels(
-    masks_KHW: NDArray[np.bool_], truth_HW: NDArray[np.integer[Any]], labels: Sequence[int]
+    masks_KHW: Bools, truth_HW: Integers, labels: Sequence[int]
 ) -> dict[int, tuple[int, ...]]:
     true_NHW = np.stack([truth_HW == label for label in labels])
     overlap_KN = np.einsum("khw,nhw->kn", masks_KHW.astype(np.float32), true_NHW.astype(np.float32))
     union_KN = masks_KHW.sum((1, 2))[:, None] + true_NHW.sum((1, 2)) - overlap_KN
     iou_KN = overlap_KN / np.maximum(union_KN, 1)
-    chosen = {
-        int(k): int(n) for k, n in zip(*linear_sum_assignment(-iou_KN), strict=True) if iou_KN[k, n] > 0
-    }
+    rows, columns = (index.tolist() for index in linear_sum_assignment(-iou_KN))
+    chosen = {k: n for k, n in zip(rows, columns, strict=True) if iou_KN[k, n] > 0}
     # Slots left over go to whatever covers most of them: the robot and the background may take several.
     most_K = {k: int(overlap_KN[k].argmax()) for k in range(len(masks_KHW)) if overlap_KN[k].any()}
     owner_K = most_K | chosen

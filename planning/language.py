@@ -2,7 +2,7 @@
 
     put the red block in the blue bowl and the green block in the gray bowl
 
-The grammar of the data's captions (paper, section 4.1). What may stand between two "and" says `RELATIONS`.
+The grammar of the data's captions (paper, section 4.1); `RELATIONS` has what may stand between two "and".
 """
 
 from __future__ import annotations
@@ -25,18 +25,13 @@ class Thing:
 
 @dataclass(frozen=True, order=True)
 class Instruction:
-    """One pick-and-place.
-
-    Attributes:
-        relation: how the thing shall stand to its target; a key of `RELATIONS`.
-        thing: what is moved.
-        target: where it is moved to.
+    """One pick-and-place: a thing is moved so that it stands to its target in a relation.
 
     Raises:
         ValueError: if there is no such relation, or it does not join these kinds of things.
     """
 
-    relation: str
+    relation: str  # a key of `RELATIONS`
     thing: Thing
     target: Thing
 
@@ -75,7 +70,7 @@ class Instruction:
 
 @dataclass(frozen=True)
 class Goal:
-    """Which instructions shall be fulfilled at the end; the order does not matter.
+    """Instructions that shall be fulfilled at the end, in any order.
 
     Raises:
         ValueError: if there is no instruction, or one thing is sent to two places.
@@ -90,11 +85,7 @@ class Goal:
 
     @classmethod
     def parse(cls, text: str) -> Goal:
-        """All instructions of a sentence, in its order.
-
-        Raises:
-            ValueError: if it has none, or moves one thing twice.
-        """
+        """All instructions of a sentence, in its order. Raises as `Goal`."""
         return cls(_parse(text))
 
     @property
@@ -107,10 +98,8 @@ def _parse(text: str) -> tuple[Instruction, ...]:
     """Whatever a sentence asks for, in its order."""
     found = []
     for name, relation in RELATIONS.items():
+        kind, target_kind = relation.kinds
         for match in relation.pattern.finditer(text.lower()):
-            things = (
-                Thing(match[role], kind)
-                for role, kind in zip(("thing", "target"), relation.kinds, strict=True)
-            )
-            found.append((match.start(), Instruction(name, *things)))
+            thing, target = Thing(match["thing"], kind), Thing(match["target"], target_kind)
+            found.append((match.start(), Instruction(name, thing, target)))
     return tuple(instruction for _, instruction in sorted(found))

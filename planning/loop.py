@@ -14,7 +14,7 @@ from planning.camera import PinholeCamera
 from planning.controller import Controller, PickAndPlace
 from planning.grounding import AppearanceGrounder, Grounder, GroundingError
 from planning.language import Goal, Instruction
-from planning.planners import Plan, Planner
+from planning.planners import Plan, Planner, observe
 from planning.scores import unmet
 
 if TYPE_CHECKING:
@@ -25,44 +25,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One turn of the loop.
+    """One turn of the loop."""
 
-    Attributes:
-        rgb: (H, W, 3) the observation that was planned from.
-        plan: what the planner decided.
-        instruction: the step of that plan that was carried out.
-        rollout: how that step was imagined, B = 1.
-        action: what was done.
-        believes_reached: whether the planner's own eyes say afterwards that the goal is reached.
-    """
-
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]  # (H, W, 3), what was seen before the action
     plan: Plan
-    instruction: Instruction
-    rollout: Rollout
+    instruction: Instruction  # the step of the plan that was carried out
+    rollout: Rollout  # how that step was imagined, B = 1
     action: PickAndPlace
-    believes_reached: bool
+    believes_reached: bool  # whether the planner's own eyes say afterwards that the goal is reached
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeResult:
-    """What came of an episode.
+    """What came of an episode."""
 
-    Attributes:
-        success: the simulator's verdict after the last action.
-        gained: by how much the share of the goal that holds rose, by the environment's rewards: 1 where nothing of it
-            held at the start and all does at the end.
-        believes_reached: the planner's own verdict at that moment.
-        attempts: the turns of the loop; empty if the scene could not be grounded.
-        error: why the loop gave up, or None.
-        frames: (T, H, W, 3) what the camera saw, first observation included (with `record_frames`, all of it).
-    """
-
-    success: bool
-    gained: float
-    believes_reached: bool
-    attempts: tuple[Attempt, ...]
-    error: str | None
+    success: bool  # the simulator's verdict after the last action
+    gained: float  # sum of the rewards: by how much the share of the goal that holds rose
+    believes_reached: bool  # the planner's own verdict after the last action
+    attempts: tuple[Attempt, ...]  # empty if the scene could not be grounded
+    error: str | None  # why the loop gave up
+    # (T, H, W, 3): the observations, first one included; with `record_frames` all that the camera saw.
     frames: NDArray[np.uint8]
 
     @property
@@ -90,9 +72,8 @@ def run_episode(
 ) -> EpisodeResult:
     """Reset a `control="primitive"` environment and pursue a goal in it.
 
-    The planner sees pictures and what `ground` and `controller` take of `info`: by default camera and palette. Reward,
-    `terminated` and `is_success`, by which the simulator tells success, are read for the result and nothing else:
-    whoever does not see that the goal is reached goes on, and may undo it.
+    The planner sees pictures and what `ground` and `controller` take of `info`. The simulator's verdict goes into the
+    result and nowhere else: whoever does not see that the goal is reached goes on, and may undo it.
 
     Args:
         goal: by default what the environment's instruction says.
@@ -135,31 +116,19 @@ def run_episode(
         within_reach = np.clip(action.to_action(), env.action_space.low, env.action_space.high)
         observation, reward, _, truncated, info = env.step(within_reach)
         rgb, gained = observation["rgb"], gained + float(reward)
-        frames.append(_frames(info, rgb))
+        frames.append(np.asarray(info["frames"]) if "frames" in info else rgb[None])
         reached = _looks_reached(planner, rgb, goal, ground(info))
         attempts.append(Attempt(seen, plan, instruction, rollout, action, reached))
         if replan:
             queue = []
         if truncated or (reached if replan else not queue):
             break
-    return EpisodeResult(
-        success=bool(info["is_success"]),
-        gained=gained,
-        believes_reached=reached,
-        attempts=tuple(attempts),
-        error=error,
-        frames=np.concatenate(frames),
-    )
+    success = bool(info["is_success"])
+    return EpisodeResult(success, gained, reached, tuple(attempts), error, np.concatenate(frames))
 
 
 def _looks_reached(planner: Planner, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> bool:
-    parsed = planner.world_model.parse(rgb[None])
     try:
-        return not unmet(parsed, grounder(parsed).with_kinds(goal.things), goal)
+        return not unmet(*observe(planner.world_model, rgb, goal, grounder), goal)
     except GroundingError:  # what cannot be seen is not known to be reached
         return False
-
-
-def _frames(info: Mapping[str, Any], rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """What the camera saw during a primitive, or only its end where the environment records no frames."""
-    return np.asarray(info["frames"]) if "frames" in info else rgb[None]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+if TYPE_CHECKING:
+    from textocvp.rollout import Rollout
+
+Bools = NDArray[np.bool_]
 UNSEEN = float("inf")  # the distance to something that no pixel shows
 
 
@@ -16,6 +22,11 @@ def hard_masks(masks_NKHW: Tensor) -> Tensor:
     winner_N1HW = masks_NKHW.argmax(-3, keepdim=True)
     slots_K11 = torch.arange(masks_NKHW.shape[-3], device=masks_NKHW.device)[:, None, None]
     return winner_N1HW == slots_K11
+
+
+def frame_masks(rollout: Rollout, frame: int) -> Bools:
+    """The hard masks (B, K, H, W) of one frame of a batch of rollouts."""
+    return hard_masks(rollout.decode_masks([frame])[:, 0]).cpu().numpy()
 
 
 def centroids(masks_NHW: Tensor) -> Tensor:
@@ -34,10 +45,9 @@ def centroid_distance(a_NHW: Tensor, b_NHW: Tensor) -> Tensor:
 
 
 def contact_distance(a_NHW: Tensor, b_NHW: Tensor) -> Tensor:
-    """Smallest distance between a pixel of one bool mask (..., H, W) and a pixel of the other.
+    """Smallest distance (...) between the pixels of two bool masks (..., H, W), in pixels between pixel centres.
 
-    Returns:
-        (...) in pixels, exact: 0 where they overlap, 1 for neighbours, inf where one is empty.
+    Exact: 0 where they overlap, 1 for neighbours, inf where one is empty.
     """
     lead, size = a_NHW.shape[:-2], a_NHW.shape[-2:]
     a_NHW, b_NHW = a_NHW.reshape(-1, *size), b_NHW.reshape(-1, *size)
@@ -65,7 +75,7 @@ def _outline_points(masks_NHW: Tensor, filler: float) -> Tensor:
     return points_NP2
 
 
-def center_inside(inner_HW: NDArray[np.bool_], outer_HW: NDArray[np.bool_]) -> bool:
+def center_inside(inner_HW: Bools, outer_HW: Bools) -> bool:
     """Whether the centroid of one bool mask (H, W) lies within the convex outline of another one's pixels."""
     if not inner_HW.any() or outer_HW.sum() < 3:
         return False

@@ -1,14 +1,11 @@
-"""Planners: imagine candidate instructions with a world model, score what was imagined, choose.
-
-A planner knows the world model only through `Imagines` and reads nothing but rollouts.
-"""
+"""Planners: imagine candidate instructions with a world model, score what was imagined, choose."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +13,7 @@ from numpy.typing import NDArray
 
 from planning.grounding import Grounder, Grounding, GroundingError
 from planning.language import Goal, Instruction
-from planning.masks import hard_masks
+from planning.masks import frame_masks
 from planning.relations import RELATIONS
 from planning.scores import (
     DEFAULT_CRITERION,
@@ -32,51 +29,34 @@ from planning.scores import (
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
-_T = TypeVar("_T")
-
 
 class Imagines(Protocol):
-    """What a planner needs of a world model."""
+    """All that a planner knows of a world model."""
 
     def parse(self, video: NDArray[np.uint8], *, seed: int = 0) -> Rollout:
         """The slots of a true video (T, H, W, 3), without imagination."""
-        ...
 
     def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         """Imagine one scene (B = 1, its last frame) under n texts, or n scenes under n texts: a batch of n."""
-        ...
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sequence of instructions that was considered.
+    """A sequence of instructions that was considered."""
 
-    Attributes:
-        instructions: what would be done, in order.
-        score: of the goal at its imagined end, higher is better.
-        reaches_goal: whether the criterion says so of the imagined rollouts.
-    """
-
-    instructions: tuple[Instruction, ...]
-    score: float
-    reaches_goal: bool
+    instructions: tuple[Instruction, ...]  # in the order in which they would be carried out
+    score: float  # of the goal at its imagined end, higher is better
+    reaches_goal: bool  # whether the criterion says so of what was imagined
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a planner decided on.
+    """What a planner decided on."""
 
-    Attributes:
-        ranking: all candidates, best first.
-        rollouts: one imagined rollout (B = 1) for each instruction of the best candidate.
-        grounding: of the observation that was planned from.
-        seconds: planning time, parsing included.
-    """
-
-    ranking: tuple[Candidate, ...]
-    rollouts: tuple[Rollout, ...]
-    grounding: Grounding
-    seconds: float
+    ranking: tuple[Candidate, ...]  # all of them, best first
+    rollouts: tuple[Rollout, ...]  # as imagined, B = 1: one for each instruction of the best candidate
+    grounding: Grounding  # of the observation that was planned from
+    seconds: float  # planning time, parsing included
 
     @property
     def best(self) -> Candidate:
@@ -105,7 +85,6 @@ class Planner(Protocol):
         Raises:
             GroundingError: if what the plan is made of cannot be found in the picture.
         """
-        ...
 
 
 def watched_frames(length: int, settle: int, stride: int) -> tuple[int, ...]:
@@ -115,49 +94,38 @@ def watched_frames(length: int, settle: int, stride: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """A sequence under search, and where each instruction of it was imagined (batch and row in it)."""
+    """A sequence under search."""
 
     instructions: tuple[Instruction, ...] = ()
-    imagined: tuple[tuple[Rollout, int], ...] = ()
+    imagined: tuple[tuple[Rollout, int], ...] = ()  # of each instruction: the batch, and the row in it
 
 
 @dataclass
 class BeamPlanner:
-    """Beam search over sequences of instructions.
+    """Beam search over sequences of instructions, which move each thing at most once.
 
     Each step is imagined from where the last imagined one ended; all candidates of a step are one batch. A sequence of
     n instructions is worth the mean of its n best scores, one for each instruction of the goal that does not hold yet,
-    over its whole imagined course. A sequence moves each thing once.
-
-    Attributes:
-        world_model: imagines.
-        score: ranks a course against one instruction of the goal.
-        criterion: says whether it fulfils that instruction.
-        depth: instructions in a plan; None plans for as many as do not hold yet, which is also the most.
-        candidates: what a step may be: any instruction of the `scene`, or those that move a thing of the `goal`.
-        one_block_per_bowl: leave out steps into a bowl in which another block is seen to lie by then: a model that has
-            never seen two blocks meet in a bowl imagines that both fit.
-        beam: how many sequences are kept after each step; 0 keeps all (exhaustive).
-        horizon: frames to imagine for each step.
-        stride: of the frames during a carry, every how many are decoded and scored (the last ones always are).
-        seed: of the slot sampling.
+    over its whole imagined course.
     """
 
     world_model: Imagines
-    score: Score = DEFAULT_SCORE
-    criterion: SuccessCriterion = DEFAULT_CRITERION
-    depth: int | None = None
-    candidates: Literal["goal", "scene"] = "goal"
+    score: Score = DEFAULT_SCORE  # ranks a course against one instruction of the goal
+    criterion: SuccessCriterion = DEFAULT_CRITERION  # says whether it fulfils that instruction
+    depth: int | None = None  # instructions in a plan; at most, and by default, as many as do not hold yet
+    candidates: Literal["goal", "scene"] = "goal"  # move a thing of the goal, or any thing of the scene
+    # Leave out steps into a bowl in which another block is seen to lie by then: a model that has never seen two blocks
+    # meet in a bowl imagines that both fit.
     one_block_per_bowl: bool = True
-    beam: int = 4
-    horizon: int = 24
-    stride: int = 3
-    seed: int = 0
+    beam: int = 4  # sequences that are kept after each step; 0 keeps all (exhaustive)
+    horizon: int = 24  # frames to imagine for each step
+    stride: int = 3  # of the frames that are decoded and scored; the last ones always are
+    seed: int = 0  # of the slot sampling
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
         """The best sequence; see `Planner.plan`."""
         began = perf_counter()
-        parsed, grounding = _observe(self.world_model, rgb, goal, grounder, self.seed)
+        parsed, grounding = observe(self.world_model, rgb, goal, grounder, self.seed)
         wanted = unmet(parsed, grounding, goal) or goal.instructions
         allowed = _allowed(grounding, goal)
         if self.candidates == "goal":
@@ -165,7 +133,7 @@ class BeamPlanner:
         depth = min(self.depth or len(wanted), len(wanted))
 
         branches, kept, starts = [_Branch()], [0], parsed
-        traces: list[Trace] = []
+        traces: list[Trace] = []  # one for each wanted instruction, of all branches
         for done in range(depth):
             steps = self._steps([branches[i] for i in kept], allowed, starts, grounding)
             rows, texts = [row for row, _ in steps], [one.text for _, one in steps]
@@ -174,14 +142,14 @@ class BeamPlanner:
             length = rollout.slots.shape[1]
             frames = watched_frames(length, self.criterion.thresholds.settle_frames, self.stride)
             new = [measure_rollout(rollout, grounding, want, frames=frames) for want in wanted]
+            parents = [kept[row] for row in rows]
             if done:
-                before = [trace.select([kept[row] for row in rows]) for trace in traces]
-                new = [old.then(trace, done * length) for old, trace in zip(before, new, strict=True)]
+                both = zip(traces, new, strict=True)
+                new = [old.select(parents).then(trace, done * length) for old, trace in both]
             traces = new
-            parents = [branches[kept[row]] for row in rows]
             branches = [
-                _Branch((*parent.instructions, one), (*parent.imagined, (rollout, i)))
-                for i, (parent, (_, one)) in enumerate(zip(parents, steps, strict=True))
+                _Branch((*branches[p].instructions, one), (*branches[p].imagined, (rollout, i)))
+                for i, (p, (_, one)) in enumerate(zip(parents, steps, strict=True))
             ]
             scores = self._scores(traces, depth)
             ranked = sorted(range(len(steps)), key=lambda i: scores[i], reverse=True)
@@ -205,8 +173,7 @@ class BeamPlanner:
         ]
         if not self.one_block_per_bowl:
             return steps
-        masks_BKHW = hard_masks(starts.decode_masks([-1])[:, 0]).cpu().numpy()
-        inside = [contents(masks_KHW, grounding) for masks_KHW in masks_BKHW]
+        inside = [contents(masks_KHW, grounding) for masks_KHW in frame_masks(starts, -1)]
         free = [(row, one) for row, one in steps if inside[row].get(one.target, set()) <= {one.thing}]
         return free or steps  # should no bowl have room, trying is better than giving up
 
@@ -220,29 +187,22 @@ class BeamPlanner:
 
 @dataclass
 class RandomPlanner:
-    """The control row: random instructions, imagined only to be carried out.
+    """The control row: random instructions, imagined only to be carried out. See `BeamPlanner` for the other options.
 
-    Attributes:
-        world_model: imagines.
-        rng: the source of chance.
-        depth: instructions in a plan; None plans for as many of the goal's as do not hold yet, which is also the most.
-        from_goal: take the goal's own instructions, so that only their order is left to chance. Otherwise a plan of
-            depth 1 is any instruction of the scene, and in a longer one no thing and no target comes twice.
-        horizon: frames to imagine for each step.
-        seed: of the slot sampling.
+    A plan of depth 1 is any instruction of the scene. In a longer one no thing and no target comes twice.
     """
 
     world_model: Imagines
     rng: np.random.Generator
     depth: int | None = None
-    from_goal: bool = False
+    from_goal: bool = False  # take the goal's own instructions: only their order is left to chance
     horizon: int = 24
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
         """A random sequence. With depth 1 the rest of the ranking is the rest of the instructions, in random order."""
         began = perf_counter()
-        parsed, grounding = _observe(self.world_model, rgb, goal, grounder, self.seed)
+        parsed, grounding = observe(self.world_model, rgb, goal, grounder, self.seed)
         sequences = self._draw(parsed, grounding, goal)
         rollouts, start = [], parsed
         for one in sequences[0]:
@@ -259,19 +219,17 @@ class RandomPlanner:
         if self.from_goal:
             return [tuple(self._shuffled(wanted)[:depth])]
         allowed = _allowed(grounding, goal)
-        things, targets = (
-            self._shuffled(sorted({one.things[role] for one in allowed}))[:depth] for role in (0, 1)
-        )
         by_things = {one.things: one for one in allowed}
+        things, targets = (self._shuffled(sorted(set(ones)))[:depth] for ones in zip(*by_things, strict=True))
         drawn = [by_things[pair] for pair in zip(things, targets, strict=False) if pair in by_things]
         return [tuple(drawn or self._shuffled(allowed)[:1])]
 
-    def _shuffled(self, values: Sequence[_T]) -> list[_T]:
+    def _shuffled(self, values: Sequence[Any]) -> list[Any]:
         return [values[i] for i in self.rng.permutation(len(values))]
 
 
-def _observe(
-    world_model: Imagines, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder, seed: int
+def observe(
+    world_model: Imagines, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder, seed: int = 0
 ) -> tuple[Rollout, Grounding]:
     """A picture (H, W, 3), parsed and grounded; the goal's sentence says of what kind its things are."""
     parsed = world_model.parse(rgb[None], seed=seed)

@@ -1,7 +1,6 @@
 """What a sentence can ask for: one `Relation` for each way in which a thing can stand to its target.
 
 To add one, add its entry to `RELATIONS`. Sentences are then parsed, planned, scored and carried out with it.
-Its functions see the masks of the two things and nothing else.
 """
 
 from __future__ import annotations
@@ -10,33 +9,23 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
-from planning.masks import center_inside, centroid_distance
+from planning.masks import Bools, center_inside, centroid_distance
 
 
 @dataclass(frozen=True)
 class Relation:
-    """One way in which a thing can stand to its target.
+    """One way in which a thing can stand to its target."""
 
-    Attributes:
-        template: the part of a sentence that asks for it; `{thing}` and `{target}` stand for "red block" and so on.
-        kinds: of the thing and of its target.
-        distance: how far two bool masks (..., H, W) of thing and target are from it: (...) in pixels, inf where
-            one of them is empty.
-        within_px: an imagined rollout fulfils it while that distance is at most this.
-        holds: whether bool masks (H, W) of thing and target show it, in the frame that is seen.
-        place_height: height above the table, in metres, of the point that the thing's slot is centred on then.
-    """
-
-    template: str
-    kinds: tuple[str, str]
+    template: str  # what asks for it in a sentence; `{thing}` and `{target}` stand for "red block" and so on
+    kinds: tuple[str, str]  # of the thing and of its target
+    # How far bool masks (..., H, W) of thing and target are from it: (...) in pixels, inf where one is empty.
     distance: Callable[[Tensor, Tensor], Tensor]
-    within_px: float
-    holds: Callable[[NDArray[np.bool_], NDArray[np.bool_]], bool]
-    place_height: float
+    within_px: float  # an imagined rollout fulfils it while that distance is at most this
+    # Whether bool masks (H, W) of thing and target show it, in the frame that is seen.
+    holds: Callable[[Bools, Bools], bool]
+    place_height: float  # metres above the table of the point that the thing's slot is centred on then
 
     @property
     def pattern(self) -> re.Pattern[str]:
@@ -49,18 +38,11 @@ class Relation:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When a rollout shows that the robot moved a thing, for 64x64 pictures of the `close` camera.
+    """When a rollout shows that the robot moved a thing, for 64x64 pictures of the `close` camera."""
 
-    Attributes:
-        contact_px: the arm holds a thing while the smallest distance between pixels of their masks is at most
-            this, in pixels between pixel centres (1 = neighbours).
-        contact_frames: for how many consecutive frames it must hold it.
-        settle_frames: for how many last frames of the rollout the relation must be fulfilled.
-    """
-
-    contact_px: float
-    contact_frames: int
-    settle_frames: int
+    contact_px: float  # the arm holds a thing while their `contact_distance` is at most this
+    contact_frames: int  # for how many frames in a row it must hold it
+    settle_frames: int  # for how many last frames of the rollout the relation must be fulfilled
 
 
 # Calibrated once with `experiments/calibrate.py` on the simulator's masks of 200 successful val episodes, before any

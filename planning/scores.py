@@ -1,8 +1,7 @@
 """What masks say: whether instructions hold in a frame, and how well a rollout fulfils them.
 
-`unmet` looks at one frame. `measure` turns the masks of a rollout into a `Trace` of two distances a frame. Everything
-else reads a `Trace`: `SuccessCriterion` says whether the instruction was carried out, a `Score` ranks candidates.
-Scores compose, and none of them knows where the masks came from, or which relation they measure.
+`unmet` looks at one frame. `measure` turns the masks of a rollout into a `Trace` of two distances a frame. From that
+`SuccessCriterion` tells whether the instruction was carried out, and a `Score` ranks candidates.
 """
 
 from __future__ import annotations
@@ -13,24 +12,19 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from planning.grounding import Grounding
 from planning.language import Goal, Instruction, Thing
-from planning.masks import contact_distance, hard_masks
+from planning.masks import Bools, contact_distance, frame_masks
 from planning.relations import RELATIONS, THRESHOLDS, Thresholds
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
 
-def holds(masks_KHW: NDArray[np.bool_], grounding: Grounding, instruction: Instruction) -> bool:
-    """Whether the bool masks (K, H, W) of one frame show what an instruction asks for.
-
-    Raises:
-        GroundingError: if the grounding lacks its thing or target.
-    """
+def holds(masks_KHW: Bools, grounding: Grounding, instruction: Instruction) -> bool:
+    """Whether bool masks (K, H, W) show what an instruction asks for; a GroundingError if its things are not seen."""
     thing_HW, target_HW = (
         np.any(masks_KHW[list(grounding.slots_of(one))], axis=0) for one in instruction.things
     )
@@ -43,12 +37,12 @@ def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instructio
     Raises:
         GroundingError: if a thing of the goal is not seen.
     """
-    masks_KHW = hard_masks(parsed.decode_masks([0])[0, 0]).cpu().numpy()
+    masks_KHW = frame_masks(parsed, 0)[0]
     return tuple(one for one in goal.instructions if not holds(masks_KHW, grounding, one))
 
 
-def contents(masks_KHW: NDArray[np.bool_], grounding: Grounding) -> dict[Thing, set[Thing]]:
-    """Which things are seen to lie in each target of the relation `in`, in the bool masks (K, H, W) of one frame."""
+def contents(masks_KHW: Bools, grounding: Grounding) -> dict[Thing, set[Thing]]:
+    """The things that lie in each target of the relation `in`, by the bool masks (K, H, W) of one frame."""
     inside: dict[Thing, set[Thing]] = {}
     for one in grounding.instructions("in"):
         if holds(masks_KHW, grounding, one):
@@ -58,20 +52,12 @@ def contents(masks_KHW: NDArray[np.bool_], grounding: Grounding) -> dict[Thing, 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Distances along B rollouts, at the t frames that were looked at.
+    """Distances along B rollouts at t frames, in pixels; inf where one of the two is not seen."""
 
-    Attributes:
-        frames: (t,) increasing indices of those frames in the rollout.
-        contact_Bt: smallest distance between a pixel of the arm and a pixel of the thing, in pixels; inf in
-            frames where one of them is not seen.
-        distance_Bt: how far thing and target are from the relation (`Relation.distance`), in pixels; inf as above.
-        within_B: up to which distance the relation is fulfilled (`Relation.within_px`), in pixels.
-    """
-
-    frames: tuple[int, ...]
-    contact_Bt: Tensor
-    distance_Bt: Tensor
-    within_B: Tensor
+    frames: tuple[int, ...]  # (t,), increasing indices in the rollout
+    contact_Bt: Tensor  # between arm and thing: `contact_distance`
+    distance_Bt: Tensor  # how far thing and target are from the relation: `Relation.distance`
+    within_B: Tensor  # up to which distance it is fulfilled: `Relation.within_px`
 
     def then(self, later: Trace, length: int) -> Trace:
         """This trace and a later one that starts where this one's rollout of `length` frames ends."""
@@ -184,10 +170,10 @@ def measure_rollout(
 
 @dataclass(frozen=True)
 class SuccessCriterion:
-    """Says of each rollout of a trace whether the instruction was carried out.
+    """Says of each rollout of a trace whether the instruction was carried out (paper, section 4.4).
 
-    The criterion of the paper's controllability study (section 4.4): the arm stays at the named thing for some frames
-    in a row, and the thing ends as asked for. Look at every frame for the criterion as calibrated.
+    It was if the arm stays at the thing for some frames in a row, and the thing ends as asked for. The thresholds are
+    calibrated for traces of every frame.
     """
 
     thresholds: Thresholds = THRESHOLDS
@@ -204,7 +190,6 @@ class Score(Protocol):
 
     def __call__(self, trace: Trace) -> Tensor:
         """One score a rollout, (B,); higher is better, 1 is as good as it gets."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -212,12 +197,11 @@ class PlacementScore:
     """How near the relation is at the end: 1 at distance 0, 0 at the limit of success, negative beyond."""
 
     thresholds: Thresholds = THRESHOLDS
-    floor: float = -10.0
 
     def __call__(self, trace: Trace) -> Tensor:
-        """The mean over the last `settle_frames` looked-at frames, (B,)."""
+        """The mean over the last `settle_frames` looked-at frames, (B,), at least -10."""
         distance_Bt = trace.distance_Bt[:, -self.thresholds.settle_frames :]
-        return (1 - distance_Bt.mean(1) / trace.within_B).clamp(min=self.floor)
+        return (1 - distance_Bt.mean(1) / trace.within_B).clamp(min=-10.0)
 
 
 @dataclass(frozen=True)
@@ -233,7 +217,11 @@ class CarryScore:
 
 @dataclass(frozen=True)
 class WeightedSum:
-    """The weighted mean of other scores."""
+    """The weighted mean of other scores.
+
+    Raises:
+        ValueError: if there are not as many weights, or their sum is not positive.
+    """
 
     scores: tuple[Score, ...]
     weights: tuple[float, ...]
@@ -249,6 +237,5 @@ class WeightedSum:
         return torch.stack(parts).sum(0) / sum(self.weights)
 
 
-#: What planners use unless told otherwise.
 DEFAULT_CRITERION = SuccessCriterion()
 DEFAULT_SCORE = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))

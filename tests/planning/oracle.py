@@ -53,14 +53,13 @@ class ShapeRenderer(Renderer):
         center_BK2 = (slots_BKD[..., 7:9] + 1) / 2 * self.size
         spread_BK2 = slots_BKD[..., 9:11] / 2 * self.size
         line = torch.arange(self.size) + 0.5
-        x_BKHW = (line[None, :] - center_BK2[..., 0, None, None]).expand(-1, -1, self.size, -1)
-        y_BKHW = (line[:, None] - center_BK2[..., 1, None, None]).expand(-1, -1, -1, self.size)
+        x_BK1W = line[None, :] - center_BK2[..., 0, None, None]
+        y_BKH1 = line[:, None] - center_BK2[..., 1, None, None]
         sx, sy = spread_BK2[..., 0, None, None], spread_BK2[..., 1, None, None]
-        ellipse = (x_BKHW / (2 * sx)) ** 2 + (
-            y_BKHW / (2 * sy)
-        ) ** 2 <= 1  # a disc's edge lies 2 deviations out
-        box = (x_BKHW.abs() <= 3**0.5 * sx) & (y_BKHW.abs() <= 3**0.5 * sy)  # a box's, sqrt(3)
-        beam = (x_BKHW.abs() <= 2) & (y_BKHW <= 0)
+        # A disc's edge lies 2 deviations out, a box's sqrt(3).
+        ellipse = (x_BK1W / (2 * sx)) ** 2 + (y_BKH1 / (2 * sy)) ** 2 <= 1
+        box = (x_BK1W.abs() <= 3**0.5 * sx) & (y_BKH1.abs() <= 3**0.5 * sy)
+        beam = (x_BK1W.abs() <= 2) & (y_BKH1 <= 0)
         inside = torch.where(layer_BK11 == BOWL, ellipse, torch.where(layer_BK11 == BLOCK, box, beam))
         inside = inside & (slots_BKD[..., -1, None, None] > 0.5) | (layer_BK11 == BACKGROUND)
         return torch.where(inside, 40 * layer_BK11, -200.0).softmax(1)

@@ -1,7 +1,7 @@
 """How good masks and frames are, and how sure one can be of it. Nothing here is used to train anything.
 
-Metrics that need weights of their own are imported from `textocvp.metrics.perceptual` (LPIPS, ST-LPIPS) and
-`textocvp.metrics.jedi`. Where these weights are missing, they raise `MetricUnavailable` instead of guessing.
+Metrics that need weights of their own are in `perceptual` (LPIPS, ST-LPIPS) and `jedi`. Where weights are missing they
+raise `MetricUnavailable`: nothing is computed with random ones.
 """
 
 from textocvp.metrics.frames import psnr, ssim

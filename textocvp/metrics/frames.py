@@ -8,13 +8,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 
 def psnr(imagined: Tensor, real: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio of each frame in dB; infinite for equal frames.
-
-    Args:
-        imagined, real: (..., 3, H, W) in 0..1.
-
-    Returns:
-        (...).
+    """Peak signal-to-noise ratio (...) of frames (..., 3, H, W) in 0..1, in dB; infinite for equal ones.
 
     Raises:
         ValueError: if the shapes differ or are not of frames.
@@ -25,15 +19,9 @@ def psnr(imagined: Tensor, real: Tensor) -> Tensor:
 
 
 def ssim(imagined: Tensor, real: Tensor) -> Tensor:
-    """Structural similarity of each frame with a Gaussian window of 11 pixels and deviation 1.5, as the authors do.
+    """Structural similarity (...), at most 1, of frames (..., 3, H, W) in 0..1.
 
-    The picture is mirrored at its edges, so that pixels there count too.
-
-    Args:
-        imagined, real: (..., 3, H, W) in 0..1.
-
-    Returns:
-        (...), at most 1.
+    As the authors do: a Gaussian window of 11 pixels and deviation 1.5, and the picture mirrored at its edges.
 
     Raises:
         ValueError: if the shapes differ or are not of frames.

@@ -8,28 +8,24 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+CONFIDENCE = 0.95
+QUANTILES = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
+
 
 @dataclass(frozen=True)
 class Interval:
-    """A value and its 95 % interval.
-
-    Attributes:
-        value: the estimate.
-        low: lower end of the interval.
-        high: upper end.
-        n: how many independent samples it comes from.
-    """
+    """A value and its 95 % interval."""
 
     value: float
     low: float
     high: float
-    n: int
+    n: int  # how many independent samples it comes from
 
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> Interval:
+def wilson_interval(successes: int, trials: int) -> Interval:
     """A success rate and its Wilson score interval, which stays inside 0..1 also for few trials and for 0 or all.
 
     Raises:
@@ -37,7 +33,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> In
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"need 0 <= successes <= trials and at least one trial, got {successes} of {trials}")
-    z = float(ndtri(0.5 + confidence / 2))
+    z = float(ndtri(QUANTILES[1]))
     rate = successes / trials
     center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * (rate * (1 - rate) / trials + z**2 / (4 * trials**2)) ** 0.5
@@ -48,10 +44,10 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> In
 
 
 def ratio_interval(above: Interval, below: Interval) -> Interval:
-    """The ratio of two independent values that are not negative, with an interval made from theirs.
+    """The ratio of two independent values of at least 0; its upper end is inf where `below` may be 0.
 
     MOVER (Donner and Zou, "Closed-form confidence intervals for functions of the normal mean and standard deviation",
-    2012): unlike a bootstrap it is not empty for two rates of 1. `high` is inf where `below` may be 0.
+    2012), because a bootstrap's interval is empty for two rates of 1.
 
     Raises:
         ValueError: if the value of `below` is 0.
@@ -69,15 +65,11 @@ def ratio_interval(above: Interval, below: Interval) -> Interval:
     return Interval(p / q, 0.0 if low == float("inf") else max(0.0, low), high, min(above.n, below.n))
 
 
-def bootstrap_interval(
-    values: Any, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Interval:
+def bootstrap_interval(values: Any, *, resamples: int = 2000, seed: int = 0) -> Interval:
     """A mean and its percentile bootstrap interval.
 
     Args:
-        values: (N,) one value for each independent sample: a sequence or an episode, not its frames, which are
-            alike. nan values are left out.
-        confidence: of the interval.
+        values: (N,), one for each independent sample, nan left out. Frames of one episode are not independent.
         resamples: how many times the values are drawn again.
         seed: of the drawing.
 
@@ -85,25 +77,15 @@ def bootstrap_interval(
         ValueError: if no value is left.
     """
     array = _without_nan(values)
-    means = _resampled_means(array, resamples, np.random.default_rng(seed))
-    low, high = np.quantile(means, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    low, high = np.quantile(_resampled_means(array, resamples, np.random.default_rng(seed)), QUANTILES)
     return Interval(float(array.mean()), float(low), float(high), len(array))
 
 
-def relative_change(
-    values: Any, reference: Any, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Interval:
-    """How much larger the mean of one set of scenes is than that of another: mean / reference mean - 1.
+def relative_change(values: Any, reference: Any, *, resamples: int = 2000, seed: int = 0) -> Interval:
+    """How much larger the mean of one set of scenes is than that of another: 0.1 for 10 %. Its n is the smaller one.
 
-    The two sets are of different scenes, so each is drawn again on its own for the percentile bootstrap interval. A
-    resample whose reference mean is 0 is left out.
-
-    Args:
-        values, reference: (N,) and (M,), one value for each independent sample; nan values are left out.
-        confidence, resamples, seed: as in `bootstrap_interval`.
-
-    Returns:
-        the change, 0.1 for 10 % more; its n is that of the smaller set.
+    Arguments as `bootstrap_interval`; (N,) values and (M,) of the reference. The sets are of different scenes, so each
+    is drawn again on its own. A resample whose reference mean is 0 is left out.
 
     Raises:
         ValueError: if a set is empty or the mean of `reference` is 0.
@@ -114,7 +96,7 @@ def relative_change(
     rng = np.random.default_rng(seed)
     new_S, old_S = (_resampled_means(array, resamples, rng) for array in (new, old))
     changes = new_S[old_S != 0] / old_S[old_S != 0] - 1
-    low, high = np.quantile(changes, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    low, high = np.quantile(changes, QUANTILES)
     return Interval(float(new.mean() / old.mean() - 1), float(low), float(high), min(len(new), len(old)))
 
 

@@ -2,8 +2,7 @@
 
 Maximum mean discrepancy with a polynomial kernel between V-JEPA features of the two sets. Lower is more alike, 0 for
 equal sets. The original takes the attentive probe of V-JEPA (ViT-L, Something-Something v2); here it is that of V-JEPA
-2, which transformers has, so values compare with each other and not with those of the paper. Where its weights are not
-on the machine the metric is absent with a reason; it is never computed with random ones.
+2, which transformers has, so values compare with each other and not with those of the paper.
 """
 
 from __future__ import annotations
@@ -17,57 +16,44 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from textocvp.metrics.intervals import Interval
+from textocvp.metrics.intervals import QUANTILES, Interval
 from textocvp.metrics.perceptual import MetricUnavailable
 
 VJEPA = "facebook/vjepa2-vitl-fpc16-256-ssv2"
-#: Mean and deviation of ImageNet's colours for pictures in 0..1: what V-JEPA was trained on.
+# Of ImageNet's colours for pictures in 0..1: what V-JEPA was trained on.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def polynomial_mmd(imagined_ND: np.ndarray, real_MD: np.ndarray) -> float:
     """100 times the squared maximum mean discrepancy, biased (a set's own pairs count), kernel (x . y / D) ** 2.
 
-    Args:
-        imagined_ND, real_MD: features of the two sets.
-
     Raises:
         ValueError: unless both are (any number, D) and not empty.
     """
     kernels = _kernels(imagined_ND, real_MD)
-    ones = [np.full((1, len(kernel)), 1 / len(kernel)) for kernel in kernels[:2]]
-    return float(_discrepancy(kernels, *ones)[0])
+    return float(_discrepancy(kernels, *(np.full((1, len(own)), 1 / len(own)) for own in kernels[:2]))[0])
 
 
-def jedi(
-    imagined_ND: np.ndarray,
-    real_ND: np.ndarray,
-    *,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Interval:
+def jedi(imagined_ND: np.ndarray, real_ND: np.ndarray, *, resamples: int = 2000, seed: int = 0) -> Interval:
     """JEDi of N imagined videos and the N real ones, with a bootstrap interval over scenes.
 
-    A scene is drawn with both its videos. A scene that is drawn twice is paired with itself, which adds to the biased
-    value of every resample; the interval is therefore moved so that the resamples' mean lies on the value.
-
     Args:
-        imagined_ND, real_ND: features, row i of both from scene i.
-        confidence, resamples, seed: of the interval.
+        imagined_ND, real_ND: features, row i of both from scene i; a scene is drawn with both its videos.
+        resamples, seed: as in `bootstrap_interval`.
 
     Raises:
         ValueError: if the shapes differ or there is no video.
     """
-    if imagined_ND.shape != real_ND.shape:
-        raise ValueError(
-            f"need a real video for each imagined one, got {imagined_ND.shape} and {real_ND.shape}"
-        )
+    shapes = imagined_ND.shape, real_ND.shape
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"need a real video for each imagined one, got {shapes[0]} and {shapes[1]}")
     kernels, N = _kernels(imagined_ND, real_ND), len(real_ND)
     value = polynomial_mmd(imagined_ND, real_ND)
     shares_SN = np.random.default_rng(seed).multinomial(N, np.full(N, 1 / N), size=resamples) / N
     found_S = _discrepancy(kernels, shares_SN, shares_SN)
-    low, high = np.quantile(found_S, [0.5 - confidence / 2, 0.5 + confidence / 2]) - found_S.mean() + value
+    # A scene that is drawn twice is paired with itself, which adds to the biased value of every resample: the interval
+    # is moved so that the resamples' mean lies on the value.
+    low, high = np.quantile(found_S, QUANTILES) - found_S.mean() + value
     return Interval(value, max(0.0, min(float(low), value)), max(float(high), value), N)
 
 
@@ -92,27 +78,20 @@ def _discrepancy(kernels: tuple[np.ndarray, ...], a_SN: np.ndarray, b_SM: np.nda
 
 @dataclass(frozen=True)
 class VJepaFeatures:
-    """The attentive probe of V-JEPA 2, or the mean of its tokens where a checkpoint has no probe.
+    """The attentive probe of V-JEPA 2, or the mean of its tokens where a checkpoint has no probe."""
 
-    Attributes:
-        name: for tables.
-        model: `VJEPA2ForVideoClassification` or `VJEPA2Model`.
-    """
-
-    name: str
-    model: Any
+    name: str  # for tables
+    model: Any  # `VJEPA2ForVideoClassification` or `VJEPA2Model`
 
     @torch.no_grad()
     def __call__(self, videos_NT3HW: Tensor) -> Tensor:
         """Features (N, D) of videos (N, T, 3, H, W) in 0..1, stretched to the model's length and size."""
         config = self.model.config
-        T = videos_NT3HW.shape[1]
-        moments = torch.linspace(0, T - 1, config.frames_per_clip).round().long()
+        moments = torch.linspace(0, videos_NT3HW.shape[1] - 1, config.frames_per_clip).round().long()
         frames = videos_NT3HW[:, moments].float().to(self.model.device)
-        size = (config.crop_size, config.crop_size)
-        flat = F.interpolate(frames.flatten(0, 1), size=size, mode="bicubic", antialias=True).clamp(0, 1)
+        flat = F.interpolate(frames.flatten(0, 1), config.crop_size, mode="bicubic", antialias=True)
         mean, deviation = (flat.new_tensor(c).view(3, 1, 1) for c in (MEAN, DEVIATION))
-        pixels = ((flat - mean) / deviation).unflatten(0, frames.shape[:2])
+        pixels = ((flat.clamp(0, 1) - mean) / deviation).unflatten(0, frames.shape[:2])
         probe = getattr(self.model, "pooler", None)
         encoder = self.model if probe is None else self.model.vjepa2
         # One at a time: a video is thousands of tokens.
@@ -124,7 +103,7 @@ class VJepaFeatures:
 
 
 def load_vjepa(name_or_folder: str | Path = VJEPA) -> VJepaFeatures:
-    """V-JEPA 2 from a folder, or from the Hugging Face cache of this machine by its hub id. Nothing is fetched.
+    """V-JEPA 2 from a folder, or by its hub id from the Hugging Face cache of this machine. Nothing is fetched.
 
     Raises:
         MetricUnavailable: if its weights are not there or not complete.
@@ -133,9 +112,7 @@ def load_vjepa(name_or_folder: str | Path = VJEPA) -> VJepaFeatures:
         from transformers import AutoConfig, VJEPA2ForVideoClassification, VJEPA2Model
         from transformers.utils import logging
     except ImportError as error:
-        raise MetricUnavailable(
-            f"JEDi needs transformers of at least 4.53, which has V-JEPA 2: {error}"
-        ) from error
+        raise MetricUnavailable(f"JEDi needs transformers >= 4.53, which has V-JEPA 2: {error}") from error
 
     name = str(name_or_folder)
     before = logging.get_verbosity()

@@ -1,7 +1,8 @@
 """Masks against a segmentation: adjusted Rand index, overlap with objects, and whether slots keep their objects.
 
-A segmentation gives each pixel the label of what is seen there. Which labels are objects, and which one is the
-background, is up to the data: functions take the values.
+A segmentation gives each pixel the label of what is seen there. What the labels mean is up to the data. `masks` are
+soft masks (K, H, W), or the labels (H, W) of the slots that win the pixels; functions raise a ValueError where they
+differ in size from the segmentation (H, W).
 """
 
 from __future__ import annotations
@@ -14,15 +15,16 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-#: Objects with fewer visible pixels are left out: the overlap of a sliver says more about edges than about slots.
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+# Objects with fewer visible pixels are left out: the overlap of a sliver says more about edges than about slots.
 MIN_PIXELS = 10
+# Later frames of a video count for an object where this share of its first frame's pixels is visible.
+MIN_VISIBLE = 0.5
 
 
 def slot_labels(masks: Any) -> np.ndarray:
-    """The slot that wins each pixel: (..., K, H, W) masks to (..., H, W) whole numbers; labels pass unchanged.
-
-    A floating-point array (or tensor) is masks, a whole-number one is labels.
-    """
+    """The slot that wins each pixel: soft masks (..., K, H, W) to labels (..., H, W). Whole numbers pass as labels."""
     array = masks.detach().cpu().numpy() if isinstance(masks, Tensor) else np.asarray(masks)
     return array.argmax(axis=-3) if np.issubdtype(array.dtype, np.floating) else array
 
@@ -30,16 +32,7 @@ def slot_labels(masks: Any) -> np.ndarray:
 def foreground_ari(masks: Any, segmentation: np.ndarray, *, background: int = 0) -> float:
     """Adjusted Rand index over the pixels that are not background (Hubert and Arabie 1985).
 
-    Args:
-        masks: (K, H, W) masks or (H, W) labels.
-        segmentation: (H, W).
-        background: its label in the segmentation.
-
-    Returns:
-        1 if slots and objects divide the foreground alike, about 0 by chance; nan where there is no foreground.
-
-    Raises:
-        ValueError: if masks and segmentation differ in size.
+    It is 1 if slots and objects divide the foreground alike, about 0 by chance, and nan without a foreground.
     """
     labels, truth = _same_pixels(masks, segmentation)
     foreground = truth != background
@@ -59,47 +52,31 @@ def foreground_ari(masks: Any, segmentation: np.ndarray, *, background: int = 0)
 
 @dataclass
 class ObjectMatches:
-    """One slot for each visible object, no slot twice, so that the sum of the overlaps is largest.
+    """One slot for each visible object, no slot twice, so that the sum of the overlaps is largest."""
 
-    Attributes:
-        ids: (N,) the objects' labels in the segmentation.
-        slots: (N,) the matched slot; -1 if there are fewer slots than objects.
-        ious: (N,) intersection over union of the two; 0 if there is no slot.
-    """
-
-    ids: np.ndarray
-    slots: np.ndarray
-    ious: np.ndarray
+    ids: np.ndarray  # (N,), the objects' labels in the segmentation
+    slots: np.ndarray  # (N,), the matched slot; -1 if there are fewer slots than objects
+    ious: np.ndarray  # (N,), intersection over union of the two; 0 if there is no slot
 
 
-def overlaps(
-    masks: Any, segmentation: np.ndarray, objects: Collection[int], *, min_pixels: int = MIN_PIXELS
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def overlaps(masks: Any, segmentation: np.ndarray, objects: Collection[int]) -> Arrays:
     """Intersection over union of every slot with every visible object.
 
     Args:
-        masks: (K, H, W) masks or (H, W) labels.
-        segmentation: (H, W).
-        objects: labels of the objects that count.
-        min_pixels: objects with fewer visible pixels are left out.
+        objects: labels of the objects that count; those of fewer than `MIN_PIXELS` pixels are not visible.
 
     Returns:
-        ious (slots, N), the slots' numbers (slots,), the objects' labels (N,), both ascending.
-
-    Raises:
-        ValueError: if masks and segmentation differ in size.
+        ious (S, N), the S slots that win a pixel, the labels of the N objects, both ascending.
     """
     counts, slots, ids = _contingency(*_same_pixels(masks, segmentation))
     unions = counts.sum(axis=1, keepdims=True) + counts.sum(axis=0, keepdims=True) - counts
-    seen = np.isin(ids, list(objects)) & (counts.sum(axis=0) >= min_pixels)
+    seen = np.isin(ids, list(objects)) & (counts.sum(axis=0) >= MIN_PIXELS)
     return (counts / unions)[:, seen], slots, ids[seen]
 
 
-def object_ious(
-    masks: Any, segmentation: np.ndarray, objects: Collection[int], *, min_pixels: int = MIN_PIXELS
-) -> ObjectMatches:
-    """Match slots to the visible objects of one frame (Hungarian algorithm). Arguments and errors as `overlaps`."""
-    ious, slots, ids = overlaps(masks, segmentation, objects, min_pixels=min_pixels)
+def object_ious(masks: Any, segmentation: np.ndarray, objects: Collection[int]) -> ObjectMatches:
+    """Match slots to the visible objects of one frame (Hungarian algorithm). Arguments as `overlaps`."""
+    ious, slots, ids = overlaps(masks, segmentation, objects)
     rows, columns = linear_sum_assignment(-ious)
     matched = ObjectMatches(ids, np.full(len(ids), -1), np.zeros(len(ids)))
     matched.slots[columns] = slots[rows]
@@ -107,26 +84,14 @@ def object_ious(
     return matched
 
 
-def followed(
-    masks: Any, segmentation: np.ndarray, objects: Collection[int], *, visible: float = 0.5
-) -> np.ndarray:
+def followed(masks: Any, segmentation: np.ndarray, objects: Collection[int]) -> np.ndarray:
     """For every object of an episode's first frame: does the slot that has it there keep it to the end?
 
-    It does if that slot is the one with the largest intersection over union, above 0, in every later frame where the
-    object is visible enough.
-
-    Args:
-        masks: (T, K, H, W) masks or (T, H, W) labels.
-        segmentation: (T, H, W).
-        objects: labels of the objects that count.
-        visible: share of its pixels in the first frame that must be visible for a later frame to count (and at least
-            `MIN_PIXELS`).
+    It does if that slot has the largest intersection over union in every later frame that shows the object: at least
+    `MIN_PIXELS`, and `MIN_VISIBLE` of those of the first frame. Masks and segmentation are of T frames.
 
     Returns:
         (N,) bool, one for each visible object of the first frame. Their mean over many episodes is the follow rate.
-
-    Raises:
-        ValueError: if masks and segmentation differ in size.
     """
     labels, truth = _same_pixels(masks, segmentation)
     first = object_ious(labels[0], truth[0], objects)
@@ -135,7 +100,7 @@ def followed(
     for t in range(1, len(labels)):
         ious, slots, ids = overlaps(labels[t], truth[t], objects)
         for n, i in enumerate(first.ids):
-            if not kept[n] or (truth[t] == i).sum() < max(visible * area[n], MIN_PIXELS):
+            if not kept[n] or (truth[t] == i).sum() < max(MIN_VISIBLE * area[n], MIN_PIXELS):
                 continue
             column = ious[:, np.flatnonzero(ids == i)[0]]
             kept[n] = slots[column.argmax()] == first.slots[n]
@@ -149,7 +114,7 @@ def _same_pixels(masks: Any, segmentation: np.ndarray) -> tuple[np.ndarray, np.n
     return labels, truth
 
 
-def _contingency(labels: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _contingency(labels: np.ndarray, truth: np.ndarray) -> Arrays:
     """Pixel counts (labels, truths) and the sorted values that the two axes stand for."""
     label_values, label_index = np.unique(labels, return_inverse=True)
     truth_values, truth_index = np.unique(truth, return_inverse=True)

@@ -1,7 +1,6 @@
 """Learned distances between pictures: LPIPS (Zhang et al. 2018) and ST-LPIPS (Ghildyal and Liu 2022).
 
-LPIPS needs the weights of AlexNet, which its library fetches on first use; ST-LPIPS has its weights in a package. Where
-weights are missing the metric is absent with a reason; it is never computed with random ones.
+LPIPS needs the weights of AlexNet, which its library fetches on first use; ST-LPIPS has its weights in a package.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from textocvp.metrics.frames import check_frames
 
 CHANNELS = (64, 192, 384, 256, 256)
 MIN_SIZE = 21
-#: Mean and deviation of ImageNet's colours for pictures in -1..1, as in LPIPS.
+# Of ImageNet's colours for pictures in -1..1, as in LPIPS.
 MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _CONVOLUTIONS = ("slice1.0", "slice2.5", "slice3.9", "slice4.11", "slice5.13")
 
@@ -35,13 +34,9 @@ class MetricUnavailable(RuntimeError):
 
 @dataclass(frozen=True)
 class Features:
-    """Features of T pictures, kept so that several predictions can be compared with one true video.
+    """Features of T pictures, kept so that several predictions can be compared with one true video."""
 
-    Attributes:
-        layers: maps (T, C, h, w).
-    """
-
-    layers: tuple[Tensor, ...]
+    layers: tuple[Tensor, ...]  # maps (T, C, h, w)
 
     def first(self, frames: int) -> Features:
         """Those of the first pictures."""
@@ -50,23 +45,21 @@ class Features:
 
 @dataclass(frozen=True)
 class PerceptualDistance:
-    """A distance between pictures, lower is more alike.
+    """A distance between pictures, lower is more alike."""
 
-    Attributes:
-        name: the metric and its backbone, for tables.
-        describe: pictures (N, 3, H, W) in -1..1 to feature maps (N, C, h, w).
-        difference: the maps of N pictures and of N others to distances (N,).
-    """
-
-    name: str
-    describe: Callable[[Tensor], Sequence[Tensor]]
-    difference: Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
+    name: str  # of the metric and its backbone, for tables
+    describe: Callable[
+        [Tensor], Sequence[Tensor]
+    ]  # pictures (N, 3, H, W) in -1..1 to feature maps (N, C, h, w)
+    difference: Callable[
+        [Sequence[Tensor], Sequence[Tensor]], Tensor
+    ]  # maps of N pictures and N others to (N,)
 
     def __call__(self, imagined: Tensor, real: Tensor) -> Tensor:
         """Distance (...) of each of the frames (..., 3, H, W) in 0..1.
 
         Raises:
-            ValueError: if the shapes differ or are not of frames, or the frames are too small.
+            ValueError: if the shapes differ or are not of frames, or ST-LPIPS gets frames smaller than 21x21.
         """
         check_frames(imagined, real)
         flat = (self.features(frames.reshape(-1, *frames.shape[-3:])) for frames in (imagined, real))
@@ -99,19 +92,12 @@ class ShiftTolerantAlexNet(nn.Module):
         )
         self.weights = nn.ParameterList(nn.Parameter(torch.zeros(channels)) for channels in CHANNELS)
         line = torch.tensor([0.25, 0.5, 0.25])
-        for name, values in (
-            ("mean", torch.tensor(MEAN).view(3, 1, 1)),
-            ("deviation", torch.tensor(DEVIATION).view(3, 1, 1)),
-            ("blur", line[:, None] * line[None, :]),
-        ):
-            self.register_buffer(name, values, persistent=False)
+        self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("deviation", torch.tensor(DEVIATION).view(3, 1, 1), persistent=False)
+        self.register_buffer("blur", line[:, None] * line[None, :], persistent=False)
 
     def features(self, frames_N3HW: Tensor) -> tuple[Tensor, ...]:
-        """Five maps (N, C, h, w) of pictures in -1..1, each pixel's features of length 1.
-
-        Raises:
-            ValueError: if the pictures are smaller than 21x21.
-        """
+        """Five maps (N, C, h, w) of pictures in -1..1, each pixel's features of length 1."""
         H, W = frames_N3HW.shape[-2:]
         if min(H, W) < MIN_SIZE:
             raise ValueError(f"ST-LPIPS needs pictures of at least {MIN_SIZE}x{MIN_SIZE} pixels, not {H}x{W}")
@@ -127,16 +113,14 @@ class ShiftTolerantAlexNet(nn.Module):
 
     def compare(self, imagined: Sequence[Tensor], real: Sequence[Tensor]) -> Tensor:
         """Distances (N,) from the features of N pictures to those of N others."""
-        parts = [
-            torch.einsum("nchw,c->nhw", (a - b).square(), weight).mean(dim=(1, 2))
-            for a, b, weight in zip(imagined, real, self.weights, strict=True)
-        ]
-        return torch.stack(parts).sum(dim=0)
+        layers = zip(imagined, real, self.weights, strict=True)
+        maps = [torch.einsum("nchw,c->nhw", (a - b).square(), weight) for a, b, weight in layers]
+        return torch.stack([map_Nhw.mean(dim=(1, 2)) for map_Nhw in maps]).sum(dim=0)
 
     def _halve(self, x_NCHW: Tensor) -> Tensor:
-        channels = x_NCHW.shape[1]
-        kernel_C1hw = self.blur.expand(channels, 1, 3, 3)
-        return F.conv2d(F.pad(x_NCHW, (2, 2, 2, 2), mode="reflect"), kernel_C1hw, stride=2, groups=channels)
+        C = x_NCHW.shape[1]
+        padded_NCHW = F.pad(x_NCHW, (2, 2, 2, 2), mode="reflect")
+        return F.conv2d(padded_NCHW, self.blur.expand(C, 1, 3, 3), stride=2, groups=C)
 
 
 def load_lpips() -> PerceptualDistance:
@@ -147,30 +131,30 @@ def load_lpips() -> PerceptualDistance:
     """
     try:
         import lpips
-    # A torchvision that was built for another torch fails with RuntimeError, not with ImportError.
-    except (ImportError, RuntimeError, OSError) as error:
+    except (
+        ImportError,
+        RuntimeError,
+        OSError,
+    ) as error:  # RuntimeError: a torchvision built for another torch
         raise MetricUnavailable(
             f"LPIPS needs the package lpips and a torchvision that fits the installed torch: {error}"
         ) from error
     try:
-        # The library prints to stdout while it loads, and calls torchvision in a way that has gone out of fashion;
-        # both would end up in a study's table.
+        # The library prints while it loads, and torchvision warns: both would end up in a study's table.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             network: Any = lpips.LPIPS(net="alex", verbose=False).eval()
     except (OSError, RuntimeError) as error:
         raise MetricUnavailable(f"LPIPS could not load the weights of AlexNet: {error}") from error
     # The library takes two pictures at once, so their features are the pictures themselves.
-    return PerceptualDistance(
-        "LPIPS (AlexNet)", lambda frames: (frames,), lambda a, b: network(a[0], b[0]).flatten()
-    )
+    return PerceptualDistance("LPIPS (AlexNet)", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten())
 
 
 def load_st_lpips(weights: Path | None = None) -> PerceptualDistance:
-    """ST-LPIPS with AlexNet. Its values are not LPIPS values: they rank alike, on another scale.
+    """ST-LPIPS with AlexNet. Its values rank like those of LPIPS, on another scale.
 
     Args:
-        weights: file of the authors' weights; the one in the package stlpips_pytorch by default.
+        weights: file of the authors' weights; by default the one in the package `stlpips_pytorch`.
 
     Raises:
         MetricUnavailable: if the weights are not there, or are those of another network.
@@ -207,6 +191,5 @@ def st_lpips_weights() -> Path:
 
 
 def _no_st_lpips(reason: str) -> MetricUnavailable:
-    return MetricUnavailable(
-        f"ST-LPIPS cannot be computed: {reason}. `pip install stlpips_pytorch` brings them"
-    )
+    remedy = "`pip install stlpips_pytorch` brings them"
+    return MetricUnavailable(f"ST-LPIPS cannot be computed: {reason}. {remedy}")

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from textocvp.metrics import followed, foreground_ari, object_ious, slot_labels
+from textocvp.metrics import followed, foreground_ari, masks, object_ious, slot_labels
 
 
 def ari_by_counting_pairs(labels: np.ndarray, truth: np.ndarray) -> float:
@@ -86,16 +86,15 @@ def test_fewer_slots_than_objects_leaves_an_object_with_nothing():
     assert sorted(matched.slots.tolist()) == [-1, 0] and sorted(matched.ious.tolist()) == [0.0, 0.5]
 
 
-def test_slivers_and_labels_that_are_no_objects_do_not_count():
+def test_slivers_and_labels_that_are_no_objects_do_not_count(monkeypatch):
     segmentation, one_slot = np.ones((10, 10), int), np.zeros((10, 10), int)
     segmentation[0, :3], segmentation[5:, :] = 2, 3
     assert object_ious(one_slot, segmentation, [2, 3]).ids.tolist() == [3]
-    assert object_ious(one_slot, segmentation, [2, 3], min_pixels=1).ids.tolist() == [2, 3]
-    assert object_ious(one_slot, segmentation, [1, 3, 9]).ids.tolist() == [
-        1,
-        3,
-    ]  # the robot, where it is asked for
+    # The robot, where it is asked for.
+    assert object_ious(one_slot, segmentation, [1, 3, 9]).ids.tolist() == [1, 3]
     assert object_ious(one_slot, segmentation, []).ids.tolist() == []
+    monkeypatch.setattr(masks, "MIN_PIXELS", 1)
+    assert object_ious(one_slot, segmentation, [2, 3]).ids.tolist() == [2, 3]
 
 
 def test_the_background_has_the_label_that_the_data_gives_it():

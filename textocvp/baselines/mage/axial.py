@@ -1,9 +1,8 @@
 """The second half of MAGE: codes of the frames so far, and text, to codes of the next frame.
 
-"Make It Move" (CVPR 2022), sections 3.3 and 3.4. The motion anchor is one cross-attention block from the tokens of the
-first frame to the words. It stands at time step 0, the frames follow. Each layer attends along one axis ("Axial
-Attention in Multidimensional Transformers", Ho et al. 2019), and causally in time. From each frame a linear layer
-scores the codes of the next, all at once.
+"Make It Move" (CVPR 2022), sections 3.3 and 3.4. The motion anchor stands at time step 0, the frames follow. Each layer
+attends along one axis ("Axial Attention in Multidimensional Transformers", Ho et al. 2019). From each frame a linear
+layer scores the codes of the next, all at once.
 
 Shape suffixes: B videos, T frames, h and w codes along a side of a frame, g tokens along a side, P codes of a token,
 C width, K codes in the codebook, L words.
@@ -28,35 +27,23 @@ AXES: tuple[Axis, ...] = ("time", "height", "width")  # in the order of the dime
 
 @dataclass(frozen=True)
 class AxialConfig:
-    """From the codes of the past, and text, to the codes of the next frame.
+    """Options of `AxialTransformer`."""
 
-    Attributes:
-        dim: token width.
-        layers: of the transformer, one axis each: time, height, width, time, ...
-        heads: of its attention.
-        hidden: width of its feed-forward nets.
-        frames: the longest video, in frames, the seen one included.
-        patch: side of the square of codes that make one token. 1 as published; 2 makes a frame of 16x16 codes 64
-            tokens and so four times as cheap, with all codes of a frame still predicted at once.
-        copy: add a bonus, read off the token, to the score of the code that a place has now, and of the one it had in
-            the first frame. So the model need not learn code by code to leave a place as it is. Not published; for
-            training in minutes.
-    """
-
-    dim: int = 512
-    layers: int = 6
-    heads: int = 16
-    hidden: int = 2048
-    frames: int = 20
+    dim: int = 512  # token width
+    layers: int = 6  # one axis each: time, height, width, time, ...
+    heads: int = 16  # of the attention
+    hidden: int = 2048  # width of the feed-forward nets
+    frames: int = 20  # the longest video, the seen frame included
+    # Side of the square of codes that make one token; 1 as published. With 2, a frame of 16x16 codes is 64 tokens and
+    # so four times as cheap.
     patch: int = 1
+    # Add a bonus, read off the token, to the scores of the code that a place has now and of the one it had first. So
+    # the model need not learn code by code to leave a place as it is. Not published; for training in minutes.
     copy: bool = False
 
 
 class AxialBlock(nn.Module):
-    """Pre-norm transformer block whose attention runs along one axis of a video.
-
-    Along time it is causal: no frame sees a later one. Along height and width all tokens of a frame see each other.
-    """
+    """Pre-norm transformer block whose attention runs along one axis of a video, causally where that is time."""
 
     def __init__(self, axis: Axis, dim: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -83,7 +70,7 @@ class AxialBlock(nn.Module):
 
 
 class MotionAnchor(nn.Module):
-    """What the words mean for each place of the first frame: cross-attention, then a feed-forward net."""
+    """What the words mean for each place of the first frame: one cross-attention block."""
 
     def __init__(self, dim: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -97,9 +84,8 @@ class MotionAnchor(nn.Module):
         """(B, g, g, C). Padding is masked."""
         bias_B11L = mask_bias(~text.mask_BL)[:, None, None]
         x_BNC = tokens_BggC.flatten(1, 2)
-        x_BNC = x_BNC + self.attention(
-            self.norm_tokens(x_BNC), bias_B11L, context_XMC=self.norm_text(text.embeddings_BLC)
-        )
+        text_BLC = self.norm_text(text.embeddings_BLC)
+        x_BNC = x_BNC + self.attention(self.norm_tokens(x_BNC), bias_B11L, context_XMC=text_BLC)
         x_BNC = x_BNC + self.feed_forward(self.norm_feed_forward(x_BNC))
         return x_BNC.view(tokens_BggC.shape)
 
@@ -108,9 +94,7 @@ class AxialTransformer(nn.Module):
     """Codes and text to scores of the next codes.
 
     Args:
-        config: sizes.
         grid: codes along a side of a frame.
-        codebook_size: how many codes there are.
         text_dim: width of the words; must be `config.dim`.
 
     Raises:
@@ -161,17 +145,12 @@ class AxialTransformer(nn.Module):
     def tokens(self, codes_BThw: Tensor) -> Tensor:
         """Codes to tokens (B, T, g, g, C), each mixed with its neighbours and marked with its place."""
         x_BTggC = self.embedding(self.patches(codes_BThw)).flatten(-2)
-        B, T = x_BTggC.shape[:2]
         mixed_NCgg = self.neighbours(x_BTggC.flatten(0, 1).permute(0, 3, 1, 2))
-        x_BTggC = mixed_NCgg.permute(0, 2, 3, 1).unflatten(0, (B, T))
+        x_BTggC = mixed_NCgg.permute(0, 2, 3, 1).unflatten(0, x_BTggC.shape[:2])
         return x_BTggC + self.height_gC[:, None] + self.width_gC
 
     def start(self, codes_BThw: Tensor, text: TextTokens, speed_B: Tensor) -> Tensor:
-        """What the layers read (B, 1 + T, g, g, C): the motion anchor, then the frames.
-
-        Args:
-            speed_B: episode frames between two frames of the video.
-        """
+        """What the layers read (B, 1 + T, g, g, C): the motion anchor, then the frames; `speed_B` as in `imagine`."""
         tokens_BTggC = self.tokens(codes_BThw)
         anchor_BggC = self.anchor(tokens_BTggC[:, 0], text) + speed_B[:, None, None, None] * self.speed_C
         return torch.cat([self.enter_anchor(anchor_BggC)[:, None], self.enter_frames(tokens_BTggC)], dim=1)
@@ -179,8 +158,7 @@ class AxialTransformer(nn.Module):
     def layers(self, x_BTggC: Tensor, caches: list[KeyValueCache] | None = None) -> Tensor:
         """The axial layers, from the time step after those in the `caches`, one for each layer along time."""
         begin = caches[0].length if caches else 0
-        T = x_BTggC.shape[1]
-        x_BTggC = x_BTggC + self.time_TC[begin : begin + T, None, None]
+        x_BTggC = x_BTggC + self.time_TC[begin : begin + x_BTggC.shape[1], None, None]
         times = iter(caches or ())
         for block in self.blocks:
             x_BTggC = block(x_BTggC, next(times, None) if block.axis == "time" else None)
@@ -190,7 +168,7 @@ class AxialTransformer(nn.Module):
         """Scores (B, T, g, g, P, K): from frames 0 to T - 1 those of the codes of frames 1 to T.
 
         Raises:
-            ValueError: if there are as many frames as there are time steps, or more: the motion anchor takes one.
+            ValueError: unless T is less than `config.frames`: the motion anchor takes one time step.
         """
         T = codes_BThw.shape[1]
         if self.config.frames <= T:
@@ -213,11 +191,10 @@ class AxialTransformer(nn.Module):
     def imagine(
         self, seen_BThw: Tensor, text: TextTokens, horizon: int, speed_B: Tensor | None = None
     ) -> Tensor:
-        """The likeliest codes (B, horizon, h, w) of the frames after the seen ones, each fed back (greedy decoding).
+        """The likeliest codes (B, horizon, h, w) of the frames after T seen ones, each fed back (greedy decoding).
 
         Args:
-            seen_BThw: true codes, T frames from the first one on.
-            speed_B: episode frames between two frames; 1 by default.
+            speed_B: episode frames between two frames of the video; 1 by default.
 
         Raises:
             ValueError: if seen and imagined frames are more than `config.frames`.
@@ -240,6 +217,6 @@ class AxialTransformer(nn.Module):
 
 
 def code_loss(scores: Tensor, codes: Tensor, weights: Tensor) -> Tensor:
-    """The weighted sum of the cross-entropies of scores (..., K) against codes (...), each weighing `weights` (...)."""
+    """The weighted sum of the cross-entropies of scores (..., K) against codes (...)."""
     per_code = F.cross_entropy(scores.float().flatten(0, -2), codes.flatten(), reduction="none")
     return (weights.flatten() * per_code).sum()

@@ -1,4 +1,4 @@
-"""Attention and feed-forward net of MAGE, which unlike those of TextOCVP have biases and the published initial weights.
+"""Attention and feed-forward net of MAGE, which unlike those of TextOCVP have biases.
 
 Shape suffixes: X sequences, N tokens that ask, M tokens that are asked, C width.
 """
@@ -24,11 +24,7 @@ class FeedForward(nn.Module):
 
 
 class BiasedAttention(nn.Module):
-    """Multi-head attention whose projections have biases.
-
-    Raises:
-        ValueError: if the width cannot be divided into the heads.
-    """
+    """Multi-head attention whose projections have biases, with the published initial weights."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -49,11 +45,10 @@ class BiasedAttention(nn.Module):
         context_XMC: Tensor | None = None,
         cache: KeyValueCache | None = None,
     ) -> Tensor:
-        """Attend from tokens to themselves, or to `context_XMC`; (X, N, C).
+        """Attend from tokens to themselves and to those in the cache, or to `context_XMC`; (X, N, C).
 
         Args:
             bias: added to the logits, broadcastable to (X, heads, N, M).
-            cache: keys and values of earlier tokens, which are attended to as well; gets those of these tokens.
         """
         if context_XMC is None:
             q_XNC, k_XMC, v_XMC = self.qkv(x_XNC).chunk(3, dim=-1)

@@ -25,24 +25,15 @@ AT_ONCE = 64  # frames to decode: more take more memory, and on a CPU more time 
 
 @dataclass(frozen=True)
 class MageConfig:
-    """A whole MAGE.
+    """A whole MAGE."""
 
-    Attributes:
-        KINDS: of each part, the classes that its `kind` names.
-        name: the preset it came from.
-        vqvae: frames to codes and back.
-        text: sentences to tokens.
-        axial: codes and tokens to the next codes.
-        architecture: always `mage`; tells its checkpoints from others.
-    """
+    KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {"text": TEXT_ENCODERS}  # what a part's `kind` names
 
-    KINDS: ClassVar[Mapping[str, Mapping[str, type]]] = {"text": TEXT_ENCODERS}
-
-    name: str
+    name: str  # of the preset it came from
     vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
     text: TextConfig = field(default_factory=PublishedTextConfig)
     axial: AxialConfig = field(default_factory=AxialConfig)
-    architecture: Literal["mage"] = ARCHITECTURE
+    architecture: Literal["mage"] = ARCHITECTURE  # tells its checkpoints from others
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, ready for JSON."""
@@ -50,21 +41,12 @@ class MageConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> MageConfig:
-        """The inverse of `to_dict`.
-
-        Raises:
-            ValueError: see `textocvp.config.build`.
-        """
+        """The inverse of `to_dict`. Raises as `textocvp.config.build`."""
         return build(cls, data)
 
 
 class Mage(nn.Module):
     """Frames to codes, codes and text to the next codes, codes to frames ("Make It Move", CVPR 2022, figure 2).
-
-    Attributes:
-        vqvae: frames to codes and back.
-        text: sentences to tokens.
-        axial: codes and tokens to scores of the next codes.
 
     Args:
         text_files: the text encoder's own folder, of a checkpoint that is being loaded.
@@ -82,7 +64,7 @@ class Mage(nn.Module):
 
     @property
     def config(self) -> MageConfig:
-        """Every choice of architecture; once they are known, with the fingerprints of frozen encoders' weights."""
+        """Every choice of architecture, with the fingerprints of frozen encoders' weights once they are known."""
         return replace(self._config, vqvae=self.vqvae.config, text=self.text.config)
 
     @property
@@ -92,12 +74,9 @@ class Mage(nn.Module):
 
     @torch.no_grad()
     def imagine(self, first_B3HW: Tensor, texts: list[str], horizon: int) -> Tensor:
-        """Frames (B, horizon + 1, 3, H, W), about -1..1; the first is the given one as the VQ-VAE redraws it.
+        """Frames (B, horizon + 1, 3, H, W), about -1..1, from frames in -1..1 with a sentence each.
 
-        Args:
-            first_B3HW: frames in -1..1.
-            texts: one sentence a frame.
-            horizon: how many frames to imagine.
+        The first ones are those given, as the VQ-VAE redraws them.
 
         Raises:
             ValueError: if the horizon is longer than the model was made for, or a text is not allowed.
@@ -115,24 +94,14 @@ class Mage(nn.Module):
 
     @classmethod
     def load(cls, folder: Path, device: str | torch.device = "cpu") -> Mage:
-        """The model of a checkpoint, in evaluation mode.
-
-        Raises:
-            CheckpointError: if a file is missing or damaged, it is of another architecture, or a config field or tensor
-                does not fit; it is named.
-        """
+        """The model of a checkpoint, in evaluation mode. Raises as `read_checkpoint`."""
         files = folder / TEXT_FOLDER
         model = read_checkpoint(folder, ARCHITECTURE, lambda data: cls(MageConfig.from_dict(data), files))
         return model.to(device)
 
 
 class MageVideoModel:
-    """A `textocvp.protocols.VideoModel` without slots: it imagines frames and nothing else.
-
-    Attributes:
-        model: the network.
-        checkpoint: where it came from.
-    """
+    """A `textocvp.protocols.VideoModel` without slots: it imagines frames and nothing else."""
 
     def __init__(self, model: Mage, checkpoint: Checkpoint | None = None) -> None:
         self.model = model.eval()
@@ -140,19 +109,11 @@ class MageVideoModel:
 
     @classmethod
     def from_folder(cls, folder: Path, name: str, device: str | torch.device = "cpu") -> MageVideoModel:
-        """Load a checkpoint.
-
-        Args:
-            name: what to call it.
-
-        Raises:
-            CheckpointError: see `Mage.load`.
-        """
+        """Load a checkpoint and call it `name`. Raises as `read_checkpoint`."""
         return cls(Mage.load(folder, device), Checkpoint.of(folder, name))
 
     def __repr__(self) -> str:
-        million = sum(p.numel() for p in self.model.parameters()) / 1e6
-        H, W = self.image_size
+        million, (H, W) = sum(p.numel() for p in self.model.parameters()) / 1e6, self.image_size
         return (
             f"MageVideoModel({self.checkpoint.name!r}, {million:.1f} M parameters, {H}x{W} frames, "
             f"up to {self.longest_horizon} frames ahead, on {self.model.device})"
@@ -173,17 +134,7 @@ class MageVideoModel:
     def imagine(
         self, obs: Mapping[str, Any] | np.ndarray, text: str | Sequence[str], *, horizon: int, seed: int = 0
     ) -> Tensor:
-        """Frames (B, horizon + 1, 3, H, W), RGB 0..1, float32, as `textocvp.protocols.VideoModel.imagine`.
-
-        Args:
-            seed: changes nothing: this model draws nothing at random.
-
-        Raises:
-            TypeError: if the observation is not uint8, or a text no string.
-            ValueError: if a shape, value or size, the horizon, or a text is not allowed; the message says what is.
-
-        A word that the text encoder has never met is a `UserWarning` that names the word.
-        """
+        """As `textocvp.protocols.VideoModel.imagine`. Nothing is drawn at random: `seed` changes nothing."""
         texts = checked_texts(text, self.model.text)
         checked_horizon(horizon, self.longest_horizon)
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)

@@ -1,7 +1,6 @@
-"""The named sizes of MAGE.
+"""The named sizes of MAGE, from "Make It Move" (CVPR 2022), section 4 and its published configuration.
 
-Those of the published model are from "Make It Move" (CVPR 2022), section 4 and the configuration published with it,
-and from TextOCVP (TMLR 2026), appendix.
+Those of MAGE-DINO are from TextOCVP (TMLR 2026), appendix.
 """
 
 from __future__ import annotations
@@ -36,12 +35,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
 
 
 def mage_preset(name: str) -> MageConfig:
-    """The preset of that name.
-
-    Raises:
-        KeyError: if there is none; the message lists those that exist.
-    """
-    try:
-        return MAGE_PRESETS[name]
-    except KeyError:
-        raise KeyError(f"unknown MAGE preset {name!r}; known: {', '.join(sorted(MAGE_PRESETS))}") from None
+    """The preset of that name. The message of a KeyError lists those that exist."""
+    if name not in MAGE_PRESETS:
+        raise KeyError(f"unknown MAGE preset {name!r}; known: {', '.join(sorted(MAGE_PRESETS))}")
+    return MAGE_PRESETS[name]

@@ -23,26 +23,20 @@ FIRST_WORD = 1 + max(PAD, UNKNOWN)  # its row in the embedding: no word here sta
 
 @dataclass(frozen=True)
 class PublishedTextConfig(WordsConfig):
-    """Options of `PublishedText`.
-
-    Attributes:
-        rows: of the word embedding. Published are more than there are words; the rest is never used.
-    """
+    """Options of `PublishedText`."""
 
     kind: Literal["published"] = "published"  # type: ignore[assignment]
     dim: int = 512
     max_tokens: int = 32
     heads: int = 16
     hidden: int = 2048
-    rows: int = 30
+    rows: int = 30  # of the word embedding; as published more than there are words: the rest is never used
 
     def __post_init__(self) -> None:
         super().__post_init__()
         wanted = FIRST_WORD + len(self.vocabulary)
         if self.rows < wanted:
-            raise ValueError(
-                f"text.rows must be at least {wanted} for the words of text.vocabulary, not {self.rows}"
-            )
+            raise ValueError(f"text.rows must be at least {wanted} for text.vocabulary, not {self.rows}")
 
 
 class _PostNormBlock(nn.Module):

@@ -3,15 +3,14 @@
     textocvp train mage --vqvae runs/vqvae/checkpoint --data data/tabletop-train.h5 --val data/tabletop-val.h5 \\
         --out runs/mage
 
-Every episode is encoded once. Then the transformer learns from whole episodes, all frames in one pass, teacher forced:
-cross-entropy of the next frame's codes. As TextOCVP's predictor here does, it may in the last updates learn from frames
-that it imagined itself, from which it must predict the true next codes (dataset aggregation, Ross et al. 2011); with
-`--autoregressive 0` it is trained as published.
+Every episode is encoded once. The transformer learns from whole episodes in one pass, teacher forced: cross-entropy of
+the next frame's codes. In the last updates it also learns from frames that it imagined itself, as TextOCVP's predictor
+does here (dataset aggregation, Ross et al. 2011); with `--autoregressive 0` it is trained as published.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -69,21 +68,13 @@ class MageTraining(TrainingSettings):
 
 @dataclass(frozen=True)
 class PredictionMetrics(Metrics):
-    """How well rollouts from the first frame to the longest horizon are predicted.
+    """How well rollouts from the first frame to the longest horizon are predicted."""
 
-    Attributes:
-        psnr: mean peak signal-to-noise ratio of the imagined frames, in dB.
-        still_psnr: what it would be if the first frame, redrawn, never changed.
-        redrawn_psnr: what it would be if every code were right: the VQ-VAE's own.
-        codes: share of the imagined codes that are right.
-        changed_codes: the same over the codes that are not those of the first frame.
-    """
-
-    psnr: float
-    still_psnr: float
-    redrawn_psnr: float
-    codes: float
-    changed_codes: float
+    psnr: float  # mean over the imagined frames, in dB
+    still_psnr: float  # what it would be if the first frame, redrawn, never changed
+    redrawn_psnr: float  # what it would be if every code were right: the VQ-VAE's own
+    codes: float  # share of the imagined codes that are right
+    changed_codes: float  # the same over the codes that are not those of the first frame
 
     def __str__(self) -> str:
         return (
@@ -101,10 +92,7 @@ class MageStage(nn.Module):
         self.text, self.axial = model.text, model.axial
 
     def forward(self, seen_BThw: Tensor, words: WordBatch, speed_B: Tensor, imagined: int) -> Tensor:
-        """Scores (B, S, g, g, P, K) of the codes of frames 1 to S = T + imagined.
-
-        The transformer adds `imagined` frames to those that are seen, and predicts from every frame the next.
-        """
+        """Scores (B, S, g, g, P, K) of the codes of frames 1 to S, from T seen frames and S - T `imagined` ones."""
         text = self.text.encode(words)
         if imagined:
             added_BShw = self.axial.imagine(seen_BThw, text, imagined, speed_B)
@@ -115,10 +103,7 @@ class MageStage(nn.Module):
 
 
 def train(args: MageTraining) -> PredictionMetrics | None:
-    """Run or continue stage 2; writes `out`/checkpoint, a whole model.
-
-    Returns:
-        the metrics of all held-out episodes; None on all processes but the main one.
+    """Run or continue stage 2; writes `out`/checkpoint, a whole model, whose metrics the main process returns.
 
     Raises:
         CheckpointError: if `vqvae` is no checkpoint of a VQ-VAE.
@@ -164,11 +149,7 @@ def train(args: MageTraining) -> PredictionMetrics | None:
 
 
 def assemble(args: MageTraining, vqvae: VQVAE, episodes: Episodes) -> Mage:
-    """A model with the trained VQ-VAE, frozen, and a transformer and a text encoder for the episodes' words to train.
-
-    Raises:
-        SettingsError: if a setting is of the VQ-VAE.
-    """
+    """A model of the trained VQ-VAE, frozen, and a transformer and a text encoder for the episodes' words to train."""
     for setting in args.set:
         if setting.startswith(("vqvae", "name", "architecture")):
             raise SettingsError(f"{setting!r}: the VQ-VAE comes trained; set text.* and axial.* only")
@@ -182,14 +163,9 @@ def assemble(args: MageTraining, vqvae: VQVAE, episodes: Episodes) -> Mage:
 
 
 def cached_codes(
-    model: VQVAE, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1, *, batch: int = 2
+    model: VQVAE, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1
 ) -> FrameCache:
-    """The codes (h, w) uint16 of every frame; those that are not in `folder` yet are computed and written there.
-
-    Args:
-        process: which share of the work is this process's.
-        processes: how many share it.
-        batch: episodes at once.
+    """The codes (h, w) uint16 of every frame, kept in `folder`; processes share the work as in `FrameCache.fill`.
 
     Raises:
         CacheError: if `folder` is damaged, or holds the codes of another VQ-VAE or of other episodes.
@@ -198,9 +174,8 @@ def cached_codes(
     @torch.no_grad()
     def compute(chosen: range) -> NDArray[np.uint16]:
         found = []
-        for first in range(chosen.start, chosen.stop, batch):
-            numbers = range(first, min(first + batch, chosen.stop))
-            frames_NHW3 = np.concatenate([episodes.frames(number) for number in numbers])
+        for first in range(0, len(chosen), 2):  # more at once take more memory
+            frames_NHW3 = np.concatenate([episodes.frames(number) for number in chosen[first : first + 2]])
             found.append(model.encode(to_frames(frames_NHW3[None], model.device)[0]))
         return torch.cat(found).cpu().numpy().astype(np.uint16)
 
@@ -209,7 +184,7 @@ def cached_codes(
 
 
 def schedule(args: MageTraining, step: int, frames: int, rng: np.random.Generator) -> int:
-    """How many of the frames that update number `step` learns from are imagined; grows to all but the first."""
+    """How many of the frames that update `step` learns from are imagined; grows to all but the first."""
     begin = round(args.steps * (1 - args.autoregressive))
     if step < begin:
         return 0
@@ -218,14 +193,13 @@ def schedule(args: MageTraining, step: int, frames: int, rng: np.random.Generato
 
 
 @torch.no_grad()
-def measure(model: Mage, episodes: Episodes, chosen: Iterable[int], batch: int = 8) -> PredictionMetrics:
+def measure(model: Mage, episodes: Episodes, numbers: Sequence[int]) -> PredictionMetrics:
     """Metrics of some episodes; frames after an episode's end are its last."""
-    numbers = list(chosen)
     ratios: dict[str, list[Tensor]] = {"psnr": [], "still_psnr": [], "redrawn_psnr": []}
-    right, changed_right, changed_all = [], 0, 0
+    hits, changes = [], []
     times_T = np.arange(model.config.axial.frames)
-    for first in range(0, len(numbers), batch):
-        part = numbers[first : first + batch]
+    for first in range(0, len(numbers), 8):  # more at once take more memory
+        part = numbers[first : first + 8]
         clips = [clip[np.minimum(times_T, len(clip) - 1)] for clip in map(episodes.frames, part)]
         frames_BT3HW = to_frames(np.stack(clips), model.device)
         B, T = frames_BT3HW.shape[:2]
@@ -233,20 +207,15 @@ def measure(model: Mage, episodes: Episodes, chosen: Iterable[int], batch: int =
         with evaluating(model):
             text = model.text([episodes.instructions[number] for number in part])
             imagined_BShw = model.axial.imagine(true_BThw[:, :1], text, T - 1)
-        real = (frames_BT3HW[:, 1:] + 1) / 2
-        for name, codes in (
-            ("psnr", imagined_BShw),
-            ("still_psnr", true_BThw[:, :1].expand_as(imagined_BShw)),
-            ("redrawn_psnr", true_BThw[:, 1:]),
-        ):
+        still_BShw, right_BShw = true_BThw[:, :1].expand_as(imagined_BShw), true_BThw[:, 1:]
+        for name, codes in zip(ratios, (imagined_BShw, still_BShw, right_BShw), strict=True):
             drawn = model.vqvae.decode(codes.flatten(0, 1)).unflatten(0, (B, T - 1))
-            ratios[name].append(psnr((drawn.clamp(-1, 1) + 1) / 2, real))
-        hits, changed = imagined_BShw == true_BThw[:, 1:], true_BThw[:, 1:] != true_BThw[:, :1]
-        right.append(hits.float().mean(dim=(1, 2, 3)))
-        changed_right += int((hits & changed).sum())
-        changed_all += int(changed.sum())
+            ratios[name].append(psnr((drawn.clamp(-1, 1) + 1) / 2, (frames_BT3HW[:, 1:] + 1) / 2))
+        hits.append(imagined_BShw == right_BShw)
+        changes.append(right_BShw != still_BShw)
+    hits_NShw, changes_NShw = torch.cat(hits), torch.cat(changes)
     return PredictionMetrics(
         **{name: float(torch.cat(values).mean()) for name, values in ratios.items()},
-        codes=float(torch.cat(right).mean()),
-        changed_codes=changed_right / max(1, changed_all),
+        codes=float(hits_NShw.float().mean(dim=(1, 2, 3)).mean()),
+        changed_codes=int((hits_NShw & changes_NShw).sum()) / max(1, int(changes_NShw.sum())),
     )

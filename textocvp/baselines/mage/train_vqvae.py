@@ -8,7 +8,7 @@ and features to each other ("Neural Discrete Representation Learning" 2017, equa
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,19 +50,12 @@ class VQVAETraining(ClipTraining):
 
 @dataclass(frozen=True)
 class ReconstructionMetrics(Metrics):
-    """How well held-out frames are redrawn.
+    """How well held-out frames are redrawn."""
 
-    Attributes:
-        psnr: mean peak signal-to-noise ratio of the frames, in dB.
-        thing_psnr: the same over the pixels that are not canvas.
-        perplexity: how many codes are used, effectively.
-        codes: how many codes are used at all.
-    """
-
-    psnr: float
-    thing_psnr: float
-    perplexity: float
-    codes: int
+    psnr: float  # mean over the frames, in dB
+    thing_psnr: float  # of the pixels that are not canvas, in dB
+    perplexity: float  # how many codes are used, effectively
+    codes: int  # how many codes are used at all
 
     def __str__(self) -> str:
         return (
@@ -85,10 +78,7 @@ class CodeUses:
 
 
 def train(args: VQVAETraining) -> ReconstructionMetrics | None:
-    """Run or continue stage 1; writes `out`/checkpoint.
-
-    Returns:
-        the metrics of all held-out episodes; None on all processes but the main one.
+    """Run or continue stage 1; writes `out`/checkpoint, whose metrics the main process returns.
 
     Raises:
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
@@ -118,17 +108,14 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
             counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64, device=run.device)
             for part in run.micro_batches():
                 frames_N3HW, weights_N1HW = (x[part].flatten(0, 1) for x in (frames_BT3HW, weights_BT1HW))
-                known = () if features_BTLF is None else (features_BTLF[part].flatten(0, 1),)
+                known = None if features_BTLF is None else features_BTLF[part].flatten(0, 1)
                 with accelerator.autocast():
-                    drawn_N3HW, found = run.module(frames_N3HW, *known)
+                    drawn_N3HW, found = run.module(frames_N3HW, known)
                 image = (weights_N1HW * (drawn_N3HW - frames_N3HW).square()).sum() / (3 * whole)
-                codebook, commitment = (
-                    run.weight(part) * term for term in (found.codebook_loss, found.commitment_loss)
-                )
-                run.backward(
-                    image + codebook + args.commitment * commitment,
-                    {"image": image, "commitment": commitment},
-                )
+                terms = (found.codebook_loss, found.commitment_loss)
+                codebook, commitment = (run.weight(part) * term for term in terms)
+                total = image + codebook + args.commitment * commitment
+                run.backward(total, {"image": image, "commitment": commitment})
                 counts_K += found.codes_Nhw.flatten().bincount(minlength=len(counts_K))
             counts_K = run.total(counts_K).cpu()
             uses.counts_K += counts_K
@@ -151,14 +138,12 @@ def restart_codes(model: VQVAE, uses: CodeUses, clips: Clips, seed: int) -> None
 
 
 @torch.no_grad()
-def measure(
-    model: VQVAE, episodes: Episodes, chosen: Iterable[int], frame_step: int = 3
-) -> ReconstructionMetrics:
-    """Metrics of every `frame_step`-th frame of some episodes."""
+def measure(model: VQVAE, episodes: Episodes, numbers: Sequence[int]) -> ReconstructionMetrics:
+    """Metrics of every third frame of some episodes."""
     ratios, errors, weights = [], [], []
     counts_K = torch.zeros(model.config.codebook_size, dtype=torch.int64)
-    for index in chosen:
-        frames_N3HW = to_frames(episodes.frames(index)[None, ::frame_step], model.device)[0]
+    for index in numbers:
+        frames_N3HW = to_frames(episodes.frames(index)[None, ::3], model.device)[0]
         codes_Nhw = model.encode(frames_N3HW)
         counts_K += codes_Nhw.flatten().bincount(minlength=len(counts_K)).cpu()
         real, drawn = (frames_N3HW + 1) / 2, (model.decode(codes_Nhw).clamp(-1, 1) + 1) / 2

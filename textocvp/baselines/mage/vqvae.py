@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from math import exp, log2
+from math import exp
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -36,34 +36,22 @@ M = TypeVar("M", bound=nn.Module)
 
 @dataclass(frozen=True)
 class VQVAEConfig:
-    """From a frame to a square of codes and back.
+    """From a frame to a square of codes and back."""
 
-    Attributes:
-        image_size: side of the square frame in pixels.
-        encoder: `conv` (MAGE) or `dinov2` (MAGE-DINO: its features, frozen, become codes, and the decoder of
-            TextOCVP-DINO draws them).
-        ratio: pixels along the side of a code's square; a power of two (`conv` only).
-        channels: width of the convolutions; with `dinov2` of the decoder's first, a multiple of 32.
-        blocks: residual blocks of the encoder, and of the decoder (`conv` only).
-        codebook_size: how many codes there are.
-        code_dim: numbers a code.
-        encoder_weights: folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
-        encoder_dim: width of its features.
-        encoder_patch: side of its patches in pixels.
-        encoder_fingerprint: of its weights, set when they are first used; other weights are then an error.
-    """
-
-    image_size: int = 64
+    image_size: int = 64  # side of the square frame in pixels
+    # `conv` is MAGE. `dinov2` is MAGE-DINO: its frozen features become codes, the decoder of TextOCVP-DINO draws them.
     encoder: Literal["conv", "dinov2"] = "conv"
-    ratio: int = 4
-    channels: int = 256
-    blocks: int = 2
+    ratio: int = 4  # pixels along the side of a code's square; a power of two (`conv` only)
+    channels: int = 256  # width of the convolutions; with `dinov2` of the decoder's first, a multiple of 32
+    blocks: int = 2  # residual blocks of the encoder, and of the decoder (`conv` only)
     codebook_size: int = 512
     code_dim: int = 256
-    encoder_weights: str = ""
-    encoder_dim: int = 768
-    encoder_patch: int = 14
-    encoder_fingerprint: str = ""
+    encoder_weights: str = (
+        ""  # folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub
+    )
+    encoder_dim: int = 768  # width of its features
+    encoder_patch: int = 14  # side of its patches in pixels
+    encoder_fingerprint: str = ""  # of its weights, set when they are first used; others are then an error
 
     @property
     def grid(self) -> int:
@@ -73,19 +61,14 @@ class VQVAEConfig:
 
 @dataclass
 class Quantized:
-    """Features and the nearest codes.
+    """The codes nearest to features."""
 
-    Attributes:
-        codes_Nhw: numbers of the nearest codes.
-        vectors_NhwC: these codes. Their gradient goes straight through to the features and not to the codebook.
-        codebook_loss: mean squared distance of the codes to the features; moves the codes only (VQ term).
-        commitment_loss: the same number; moves the features only.
-    """
-
-    codes_Nhw: Tensor
-    vectors_NhwC: Tensor
-    codebook_loss: Tensor
-    commitment_loss: Tensor
+    codes_Nhw: Tensor  # their numbers
+    vectors_NhwC: (
+        Tensor  # themselves; their gradient goes straight through to the features, not to the codebook
+    )
+    codebook_loss: Tensor  # mean squared distance of codes and features; moves the codes only (VQ term)
+    commitment_loss: Tensor  # the same number; moves the features only
 
 
 class Codebook(nn.Module):
@@ -98,7 +81,7 @@ class Codebook(nn.Module):
     @torch.no_grad()
     def distances(self, features_XC: Tensor) -> Tensor:
         """Squared distances (X, K) of features (X, C) to the codes."""
-        # In full precision also where the rest is not: codes lie close to each other.
+        # In full precision even where the rest is not: codes lie close to each other.
         with full_precision(features_XC.device):
             features_XC = features_XC.detach().float()
             cross_XK = features_XC @ self.codes_KC.T
@@ -125,25 +108,17 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def restart(self, unused_K: Tensor, features_XC: Tensor, generator: torch.Generator) -> int:
-        """Put codes that nothing is near, and that would so never get a gradient, onto features.
+        """Put the unused codes onto features (X, C) of training frames, drawn on the CPU. Returns how many these are.
 
         Features far from every code that is in use are the likelier to be drawn, as in k-means++.
-
-        Args:
-            unused_K: True for each code to move.
-            features_XC: features (X, C) of training frames.
-            generator: the source of chance, on the CPU.
-
-        Returns:
-            how many codes were moved.
         """
+        # Nothing is near an unused code, so it would never get a gradient.
         count = int(unused_K.sum())
         if count == 0:
             return 0
         distances_XK = self.distances(features_XC)
-        if count < len(unused_K):
-            distances_XK = distances_XK[:, ~unused_K]
-        likelihood_X = distances_XK.amin(dim=1).clamp_min(1e-12).cpu()
+        near_XK = distances_XK if count == len(unused_K) else distances_XK[:, ~unused_K]
+        likelihood_X = near_XK.amin(dim=1).clamp_min(1e-12).cpu()
         drawn = torch.multinomial(likelihood_X, count, replacement=True, generator=generator)
         self.codes_KC[unused_K] = features_XC[drawn.to(features_XC.device)].to(self.codes_KC.dtype)
         return count
@@ -177,7 +152,7 @@ class DinoCodes(nn.Module):
         self.project = nn.Linear(config.encoder_dim, config.code_dim)
 
     def forward(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> Tensor:
-        """(N, C, h, w). `features_NLF` are those of the frames, where they are known already."""
+        """(N, C, h, w). `features_NLF` are DINOv2's, where they are known already."""
         if features_NLF is None:
             features_NLF = self.dino(frames_N3HW)
         return self.project(features_NLF).transpose(1, 2).unflatten(2, (self.cells, self.cells))
@@ -185,10 +160,10 @@ class DinoCodes(nn.Module):
 
 def _convolutions(config: VQVAEConfig) -> tuple[nn.Module, nn.Module]:
     """Encoder and decoder as published: strided convolutions, then residual blocks, and back."""
-    halvings = round(log2(config.ratio)) if config.ratio > 0 else 0
+    halvings = config.ratio.bit_length() - 1
     if halvings < 1 or 2**halvings != config.ratio or config.image_size % config.ratio:
         raise ValueError(
-            f"vqvae.ratio must be a power of two of at least 2 that divides vqvae.image_size "
+            "vqvae.ratio must be a power of two of at least 2 that divides vqvae.image_size "
             f"{config.image_size}, not {config.ratio}"
         )
     C = config.channels
@@ -197,15 +172,12 @@ def _convolutions(config: VQVAEConfig) -> tuple[nn.Module, nn.Module]:
     for i in range(halvings):
         down += [nn.Conv2d(3 if i == 0 else C, C, 4, stride=2, padding=1), nn.ReLU()]
         up += [nn.ReLU(), nn.ConvTranspose2d(C, 3 if i == halvings - 1 else C, 4, stride=2, padding=1)]
-    encoder = nn.Sequential(
-        *down[:-1],
-        *(_Residual(C) for _ in range(config.blocks)),
-        nn.Conv2d(C, config.code_dim, 1),
-    )
-    decoder = nn.Sequential(
-        nn.Conv2d(config.code_dim, C, 3, padding=1), *(_Residual(C) for _ in range(config.blocks)), *up
-    )
-    return encoder, decoder
+
+    def residual() -> list[nn.Module]:
+        return [_Residual(C) for _ in range(config.blocks)]
+
+    encoder = nn.Sequential(*down[:-1], *residual(), nn.Conv2d(C, config.code_dim, 1))
+    return encoder, nn.Sequential(nn.Conv2d(config.code_dim, C, 3, padding=1), *residual(), *up)
 
 
 class VQVAE(nn.Module):
@@ -227,7 +199,7 @@ class VQVAE(nn.Module):
 
     @property
     def config(self) -> VQVAEConfig:
-        """What it was built from; once they are known, with the fingerprint of the frozen encoder's weights."""
+        """What it was built from, with the fingerprint of the frozen encoder's weights once they are known."""
         if self.dino is None:
             return self._config
         return replace(self._config, encoder_fingerprint=self.dino.fingerprint)
@@ -243,10 +215,7 @@ class VQVAE(nn.Module):
         return self.encoder.dino if isinstance(self.encoder, DinoCodes) else None
 
     def features(self, frames_N3HW: Tensor, features_NLF: Tensor | None = None) -> Tensor:
-        """The encoder's features (N, h, w, C) of frames in -1..1.
-
-        Args:
-            features_NLF: of the frozen encoder, where they are known already.
+        """The encoder's features (N, h, w, C) of frames in -1..1, or of the frozen encoder's features.
 
         Raises:
             WeightsError: if the weights of the frozen encoder are missing.
@@ -280,29 +249,20 @@ def perplexity(counts_K: Tensor) -> float:
 
 def save_vqvae(model: VQVAE, folder: Path) -> None:
     """Write a checkpoint of a VQ-VAE alone, on which the transformer is then trained."""
-    config = {"architecture": VQVAE_ARCHITECTURE, "vqvae": asdict(model.config)}
-    write_checkpoint(folder, model, config)
+    write_checkpoint(folder, model, {"architecture": VQVAE_ARCHITECTURE, "vqvae": asdict(model.config)})
 
 
 def load_vqvae(folder: Path) -> VQVAE:
-    """The VQ-VAE of a checkpoint, in evaluation mode.
+    """The VQ-VAE of a checkpoint, in evaluation mode. Raises as `read_checkpoint`."""
 
-    Raises:
-        CheckpointError: as `read_checkpoint`.
-    """
-    return read_checkpoint(
-        folder,
-        VQVAE_ARCHITECTURE,
-        lambda data: VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "vqvae")),
-    )
+    def build_model(data: dict[str, Any]) -> VQVAE:
+        return VQVAE(build(VQVAEConfig, data.get("vqvae", {}), "vqvae"))
+
+    return read_checkpoint(folder, VQVAE_ARCHITECTURE, build_model)
 
 
 def read_checkpoint(folder: Path, architecture: str, build_model: Callable[[dict[str, Any]], M]) -> M:
-    """The model of a checkpoint, in evaluation mode.
-
-    Args:
-        architecture: what `config.json` must say.
-        build_model: makes the model from what it says.
+    """The model that `build_model` makes of a checkpoint's `config.json`, with its weights, in evaluation mode.
 
     Raises:
         CheckpointError: if a file is missing or damaged, it is of another architecture, or a config field or tensor
