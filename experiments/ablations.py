@@ -365,12 +365,13 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     outcomes = [one for one in found["predictors"] if one.scene.split == "controllability" and trained]
     reached = [sum(bool(one.figures[e.name, "original", ENDS]) for e in trained) for one in outcomes]
 
-    def clip(case: tuple[Outcome, int], rank: int, best: bool) -> PredictionClip:
-        caption = f"{case[1]} of {len(trained)} runs end in the bowl"
-        return PredictionClip(case[0].scene, shown, run.args.seed, "ablations", rank, best, caption)
-
-    ranked = list(zip(outcomes, reached, strict=True))
-    return {"pictures": extreme_clips(ranked, [-float(n) for n in reached], run.sizes.clips, clip)}
+    clips = [
+        PredictionClip(
+            one.scene, shown, run.args.seed, "ablations", f"{n} of {len(trained)} runs end in the bowl"
+        )
+        for one, n in zip(outcomes, reached, strict=True)
+    ]
+    return {"pictures": extreme_clips(clips, [-float(n) for n in reached], run.sizes.clips)}
 
 
 def rows(run: Run, found: Found) -> list[Row]:

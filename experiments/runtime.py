@@ -526,15 +526,15 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). "
             "Encode: one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours "
             "and masks. All: from observed frames to imagined ones. A dash: there is no such phase; or, at the "
-            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of what is "
-            "slow. " + " ".join(run.remarks),
+            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of "
+            "what is slow. " + " ".join(run.remarks),
             [*tables("milliseconds"), plot],
         ),
         Section(
             "Figures that travel between machines",
             "How many times longer. Milliseconds depend on the machine, ratios much less. Where two models are "
-            "compared, the ratio is taken in each round, in which both had their turn, and the median counts. Untrained "
-            "models are good for timing only.",
+            "compared, the ratio is taken in each round, in which both had their turn, and the median counts. "
+            "Untrained models are good for timing only.",
             tables("ratio"),
         ),
         Section(
