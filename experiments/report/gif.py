@@ -72,33 +72,20 @@ def gif(
     if len(sizes := {panel.shape[1:3] for panel in panels}) > 1:
         raise ValueError(f"panels differ in size: {sorted(sizes)}")
     length = max(len(panel) for panel in panels)
-    wide = _join([_join([_last(p, length) for p in row], 2, gap) for row in grid], 1, gap)
-    images = [
-        Image.fromarray(frame).resize(
-            (frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.NEAREST
-        )
-        for frame in wide
-    ]
+    held = [[panel[np.minimum(np.arange(length), len(panel) - 1)] for panel in row] for row in grid]
+    wide_THW3 = _join([_join(row, 2, gap) for row in held], 1, gap)
     # One palette for all frames, made from all of them: otherwise flat colours flicker.
-    sample = Image.fromarray(np.concatenate(list(wide), axis=0))
-    palette = sample.quantize(colors=255, method=Image.Quantize.MEDIANCUT)
-    quantized = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    durations = [int(seconds_a_frame * 1000)] * (length - 1) + [int(seconds_a_frame * 1000) * hold]
-    buffer = io.BytesIO()
-    quantized[0].save(
-        buffer,
-        format="GIF",
-        save_all=True,
-        append_images=quantized[1:],
-        duration=durations,
-        loop=0,
-        optimize=False,
+    palette = Image.fromarray(np.concatenate(wide_THW3)).quantize(colors=255, method=Image.Quantize.MEDIANCUT)
+    images = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in wide_THW3.repeat(scale, axis=1).repeat(scale, axis=2)
+    ]
+    shown, buffer = int(seconds_a_frame * 1000), io.BytesIO()
+    durations = [shown] * (length - 1) + [shown * hold]
+    images[0].save(
+        buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False
     )
     return buffer.getvalue()
-
-
-def _last(panel_THW3: np.ndarray, length: int) -> np.ndarray:
-    return np.concatenate([panel_THW3, np.repeat(panel_THW3[-1:], length - len(panel_THW3), axis=0)])
 
 
 def _join(panels: Sequence[np.ndarray], axis: int, gap: int) -> np.ndarray:

@@ -113,11 +113,8 @@ class Report:
 
     def to_html(self) -> str:
         """The page, with every image inside it."""
-        return (
-            environment()
-            .get_template("report.html.j2")
-            .render(report=self, results=self.results, uri=_data_uri, kind=_kind, seeds=_seed_text)
-        )
+        page = environment().get_template("report.html.j2")
+        return page.render(report=self, results=self.results, uri=_data_uri, kind=_kind, seeds=_seed_text)
 
     def write(self, folder: Path) -> None:
         """Write `results.json`, `report.html`, the plots as PNG and the clips as GIF into a folder."""
@@ -177,14 +174,12 @@ def _data_uri(data: bytes, mime: str) -> str:
 
 def _seed_text(seeds: Sequence[int]) -> str:
     """`0–99` for a run of consecutive seeds, else the list; long lists are cut in the middle."""
-    values = list(seeds)
+    values, shown = list(seeds), [str(seed) for seed in seeds]
     if len(values) > 2 and values == list(range(values[0], values[0] + len(values))):
         return f"{values[0]}{DASH}{values[-1]}"
     if len(values) > 12:
-        return (
-            ", ".join(map(str, values[:6])) + " … " + ", ".join(map(str, values[-3:])) + f" ({len(values)})"
-        )
-    return ", ".join(map(str, values))
+        return f"{', '.join(shown[:6])} … {', '.join(shown[-3:])} ({len(values)})"
+    return ", ".join(shown)
 
 
 @cache

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TypeVar
 
 from rich.console import Console, Group
@@ -15,10 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from experiments.report.tables import TERMINAL, Table
 
 T = TypeVar("T")
-# A declared time counts as much as so many measured units of the same part.
-TRUST_UNITS = 2.0
-# The declared times of all parts together count as much as so many seconds of measured work.
-TRUST_SECONDS = 5.0
+TRUST_UNITS = 2.0  # a declared time counts as much as so many measured units of the same part
+TRUST_SECONDS = 5.0  # the declared times of all parts together, as so many seconds of measured work
 
 
 @dataclass
@@ -115,11 +112,8 @@ class StudyProgress:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.console.is_terminal:
-            self._live.stop()
+    def __exit__(self, *error: object) -> None:
+        self._live.stop()
 
     @property
     def live(self) -> bool:

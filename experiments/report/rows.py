@@ -33,14 +33,11 @@ class Row:
     n: int  # the number of independent scenes behind it
 
     def __post_init__(self) -> None:
-        for name in ("method", "split", "variant", "metric"):
-            if not isinstance(getattr(self, name), str) or not getattr(self, name):
-                raise ValueError(f"row.{name} must be a word, got {getattr(self, name)!r}")
-        for name in ("value", "low", "high"):
-            if not is_number(getattr(self, name)):
-                raise ValueError(
-                    f"row.{name} of {self.method!r} must be a finite number, got {getattr(self, name)!r}"
-                )
+        for name, value in vars(self).items():
+            if name in ("method", "split", "variant", "metric") and not (isinstance(value, str) and value):
+                raise ValueError(f"row.{name} must be a word, got {value!r}")
+            if name in ("value", "low", "high") and not is_number(value):
+                raise ValueError(f"row.{name} of {self.method!r} must be a finite number, got {value!r}")
         if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 1:
             raise ValueError(f"row.n of {self.method!r} must be a whole number of at least 1, got {self.n!r}")
         if not self.low <= self.value <= self.high:
