@@ -28,9 +28,9 @@ from experiments.report.page import Entry, Index, Tone
 from experiments.report.results import Checkpoint, Results
 from experiments.report.tables import Cell, Table, TableRow
 from experiments.study.kept import ROOT
-from experiments.study.pool import LoadCheckpoint, LoadModel
 from experiments.study.run import OutputFolder, Run, Study, StudyArgs, UsageError, exit_in_a_line
 from textocvp.checkpoint import CheckpointError
+from textocvp.protocols import LoadCheckpoint, LoadModel
 
 NAMES = (
     "controllability", "robustness", "prediction", "objects", "ablations", "interpretability", "runtime",

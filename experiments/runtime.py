@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -35,15 +35,8 @@ from experiments.study.methods import BASELINES, Missing, lines
 from experiments.study.pool import Worker, available_cores
 from experiments.study.run import Found, Part, Run, Study, UsageError, start
 from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes
-from planning import (
-    THRESHOLDS,
-    AppearanceGrounder,
-    Instruction,
-    SuccessCriterion,
-    measure_rollout,
-    watched_frames,
-)
-from planning.scores import DEFAULT_SCORE
+from planning import AppearanceGrounder, Instruction, measure_rollout, watched_frames
+from planning.scores import DEFAULT_CRITERION, DEFAULT_SCORE
 from textocvp.baselines.mage import Mage, MageVideoModel, mage_preset
 from textocvp.config import ModelConfig
 from textocvp.metrics.intervals import Interval
@@ -125,11 +118,11 @@ def threads_word(count: int) -> str:
     return f"{count} thread" + ("s" if count > 1 else "")
 
 
-def all_timings(sizes: Sizes) -> list[Timing]:
+def all_timings(frames: Sequence[int], batches: Sequence[int], threads: Sequence[int]) -> list[Timing]:
     """Every measurement, small before large, and planning last."""
-    shapes = [("encode", 1), *product(PHASES[1:], sizes.frames)]
-    made = [Timing(p, t, b, n) for n, b, (p, t) in product(sizes.threads, sizes.batches, shapes)]
-    return made + [Timing(p, STEPS, CANDIDATES, n) for n, p in product(sizes.threads, PLANNING)]
+    shapes = [("encode", 1), *product(PHASES[1:], frames)]
+    made = [Timing(phase, t, b, n) for n, b, (phase, t) in product(threads, batches, shapes)]
+    return made + [Timing(phase, STEPS, CANDIDATES, n) for n, phase in product(threads, PLANNING)]
 
 
 # --- how time is taken ------------------------------------------------------------------------------------------------
@@ -174,8 +167,7 @@ def median_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
     if n == 0:
         raise ValueError("no values to take a median of")
     # P(the median lies between the k-th smallest and the k-th largest) = 1 - 2 P(Binomial(n, 1/2) < k)
-    outside = (1 - confidence) / 2
-    k = max((k for k in range(1, n // 2 + 1) if binom.cdf(k - 1, n, 0.5) <= outside), default=1)
+    k = max(1, int(binom.ppf((1 - confidence) / 2, n, 0.5)))
     return Interval(float(np.median(ordered)), float(ordered[k - 1]), float(ordered[n - k]), n)
 
 
@@ -307,7 +299,7 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
     assert isinstance(model, WorldModel)
     image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
     goal, parsed = Instruction.parse(sampled.texts[0]), model.parse(image_1HW3)
-    frames = watched_frames(STEPS + 1, THRESHOLDS.settle_frames, STRIDE)
+    frames = watched_frames(STEPS + 1, DEFAULT_CRITERION.thresholds.settle_frames, STRIDE)
     allowed = ground(parsed).with_kinds(goal.things).instructions(goal.relation)
     texts = [allowed[i % len(allowed)].text for i in range(CANDIDATES)]
 
@@ -316,7 +308,7 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
         grounding = ground(parsed).with_kinds(goal.things)
         rollout = model.rollout(parsed, texts, horizon=STEPS)
         trace = measure_rollout(rollout, grounding, goal, frames=frames)
-        return DEFAULT_SCORE(trace), SuccessCriterion()(trace)
+        return DEFAULT_SCORE(trace), DEFAULT_CRITERION(trace)
 
     if phase == "query":
         return query
@@ -330,23 +322,14 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
 # --- units of work ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Field:
-    """Everybody who is timed, what they look at, and how busy the machine was before."""
-
-    subjects: list[Subject]
-    sampled: list[SampledScene]
-    busy: float  # 0 idle, 1 all cores busy, more if work queued
-
-
-def prepare(run: Run) -> Field:
-    """Look at as many scenes as the largest batch has."""
+def prepare(run: Run) -> tuple[list[Subject], list[SampledScene], float]:
+    """Who is timed, what they look at, and how busy the cores were before: 0 idle, 1 all busy, more if work queued."""
     busy = os.getloadavg()[0] / CORES if hasattr(os, "getloadavg") else 0.0
     scenes = study_scenes("test", max(run.sizes.batches), run.args.seed)
     env = scenes[0].make()
     sampled = [sample_scene(env, scene) for scene in scenes]
     env.close()
-    return Field(subjects_of(run), sampled, busy)
+    return subjects_of(run), sampled, busy
 
 
 @dataclass(frozen=True)
@@ -354,23 +337,22 @@ class Race:
     """A unit of work: one phase of everybody."""
 
     what: Timing
-    field: Field
-    sizes: Sizes
+    study: Run
 
     @property
     def scenes(self) -> list[StudyScene]:
         """What is looked at."""
-        return [one.scene for one in self.field.sampled]
+        return [one.scene for one in self.study.prepared[1]]
 
     def run(self, worker: Worker) -> Seconds:
         """Time it."""
-        what, sizes = self.what, self.sizes
+        what, sizes, (subjects, sampled, _) = self.what, self.study.sizes, self.study.prepared
         torch.set_num_threads(what.threads)
         works = {
             (one.name, what): work
-            for one in self.field.subjects
+            for one in subjects
             if not (one.heavy and what.frames * what.batch > sizes.heavy)
-            and (work := one.work(what, self.field.sampled)) is not None
+            and (work := one.work(what, sampled)) is not None
         }
         taken = race(works, sizes.repeats, sizes.seconds * (2 if what.phase in PLANNING else 1))
         torch.set_num_threads(1)  # as for every unit of a study
@@ -379,57 +361,44 @@ class Race:
 
 def units(run: Run) -> dict[str, Part]:
     """Every phase, small before large."""
-    return {"phases": Part([Race(what, run.prepared, run.sizes) for what in all_timings(run.sizes)], 3.0)}
+    timings = all_timings(run.sizes.frames, run.sizes.batches, run.sizes.threads)
+    return {"phases": Part([Race(what, run) for what in timings], 3.0)}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
+DECODE, BATCH, THREADS = "decode / predict", "a scene of a batch / a scene alone", "1 thread / all"
+
+
 def rows(run: Run, found: Found) -> list[Row]:
-    """Every figure; `n` counts rounds."""
-    return rows_of({key: its for outcome in found["phases"] for key, its in outcome.items()})
-
-
-def rows_of(seconds: Seconds) -> list[Row]:
-    """Milliseconds, planning queries a second, and ratios."""
+    """Milliseconds, planning queries a second, and ratios; `n` counts rounds."""
+    seconds: Seconds = {key: its for outcome in found["phases"] for key, its in outcome.items()}
     made = []
     for (name, what), taken in seconds.items():
         figures = {"milliseconds": 1000 * taken}
         if what.phase == "query":
             figures = {"queries_per_second": 1 / taken, "candidates_per_second": CANDIDATES / taken}
-        made += [interval_row(name, *what.place, m, median_interval(values)) for m, values in figures.items()]
-    for (name, what), taken in seconds.items():
         against = AGAINST.get(name, OURS if what.phase == "all" and name != OURS else "")
         if (other := seconds.get((against, what))) is not None:
             both = min(len(taken), len(other))  # the rounds in which both took part
-            ratio = median_interval(taken[:both] / other[:both])
-            made.append(interval_row(f"{name} / {against}", *what.place, "ratio", ratio))
-        for label, above, below, factor in own_ratios(what):
-            if (name, above) in seconds and (name, below) in seconds:
+            made.append((f"{name} / {against}", what, "ratio", median_interval(taken[:both] / other[:both])))
+        made += [(name, what, metric, median_interval(values)) for metric, values in figures.items()]
+        # A subject against itself was measured at different moments, so the rounds are not paired: the medians are
+        # divided, and the interval is that of the worst case.
+        for label, meant, above, below, factor in (
+            (DECODE, what.phase == "predict", replace(what, phase="decode"), what, 1),
+            (BATCH, what.batch > 1, what, replace(what, batch=1), what.batch),
+            (THREADS, what.threads > 1, replace(what, threads=1), what, 1),
+        ):
+            if meant and (name, above) in seconds and (name, below) in seconds:
                 a, b = (median_interval(seconds[name, one]) for one in (above, below))
                 value, low, high = (
-                    a.value / b.value / factor,
-                    a.low / b.high / factor,
-                    a.high / b.low / factor,
+                    x / y / factor for x, y in ((a.value, b.value), (a.low, b.high), (a.high, b.low))
                 )
                 ratio = Interval(value, low, high, min(a.n, b.n))
-                made.append(interval_row(f"{name}: {label}", *what.place, "ratio", ratio))
-    return made
-
-
-OWN = DECODE, BATCH, THREADS = "decode / predict", "a scene of a batch / a scene alone", "1 thread / all"
-
-
-def own_ratios(what: Timing) -> Iterator[tuple[str, Timing, Timing, int]]:
-    """A subject against itself: (label, above, below, factor)."""
-    # Measured at different moments, so the rounds are not paired: the medians are divided, and the interval is that of
-    # the worst case.
-    if what.phase == "predict":
-        yield DECODE, replace(what, phase="decode"), what, 1
-    if what.batch > 1:
-        yield BATCH, what, replace(what, batch=1), what.batch
-    if what.threads > 1:
-        yield THREADS, replace(what, threads=1), what, 1
+                made.append((f"{name}: {label}", what, "ratio", ratio))
+    return [interval_row(name, *what.place, metric, interval) for name, what, metric, interval in made]
 
 
 _WINDOW, _PAPER, _MAGE = f"{WINDOW} / {OURS}", f"{PAPER_WINDOW} / {PAPER_CACHE}", f"MAGE / {OURS}"
@@ -467,18 +436,21 @@ _PAIRS = [*AGAINST.items(), *((key, OURS) for key in (*BASELINES, PAPER_CACHE))]
 RATIOS = [
     Line(key=f"{name} / {other}", kind="ours" if name == WINDOW else "control") for name, other in _PAIRS
 ]
-RATIOS += [Line(key=f"{line.key}: {label}", kind="control") for label in OWN for line in LINES]
+RATIOS += [
+    Line(key=f"{line.key}: {label}", kind="control") for label in (DECODE, BATCH, THREADS) for line in LINES
+]
 
 
 def phase_spec(metric: str, threads: int, batch: int, frames: Sequence[int] = DEFAULT.frames) -> TableSpec:
     """Milliseconds or ratios of every phase for one number of threads and one batch."""
-    made = [t for t in all_timings(Sizes(tuple(frames), (batch,), 1, 1.0, 0, threads=(threads,)))]
     made = [
         t
-        for t in made
+        for t in all_timings(frames, [batch], [threads])
         if t.phase in PHASES or (batch == 1 and (metric, t.phase) != ("milliseconds", "query"))
     ]
-    titles = [f"{t.phase} {t.frames}" if t.phase in PHASES[1:] else t.phase for t in made]
+    titles = [
+        f"{t.phase} {t.frames} x {t.batch}" if t.phase in PLANNING else f"{t.phase} {t.frames}" for t in made
+    ]
     return TableSpec(
         f"{'Ratios' if metric == 'ratio' else 'Milliseconds'}, {threads_word(threads)}, batch {batch}",
         [Column(title, *t.place, metric, None) for title, t in zip(titles, made, strict=True)],
@@ -496,7 +468,7 @@ def planning_spec(threads: int) -> TableSpec:
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    figures, sizes, busy = list(results.rows), run.sizes, run.prepared.busy
+    figures, sizes, (*_, busy) = list(results.rows), run.sizes, run.prepared
     machine = f"Measured on {results.versions['machine']}."
     if busy > 0.5:
         machine += (
@@ -526,8 +498,8 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). "
             "Encode: one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours "
             "and masks. All: from observed frames to imagined ones. A dash: there is no such phase; or, at the "
-            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of "
-            "what is slow. " + " ".join(run.remarks),
+            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of what "
+            "is slow. " + " ".join(run.remarks),
             [*tables("milliseconds"), plot],
         ),
         Section(

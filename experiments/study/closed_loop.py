@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.study.methods import METHODS, Method
-from experiments.study.pool import LoadModel, Worker
+from experiments.study.pool import Worker
 from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene
 from planning import AppearanceGrounder, EpisodeResult, Goal, SegmentationGrounder, run_episode
+from textocvp.protocols import LoadModel
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.report.tables import Line, Paper
-from experiments.study.pool import LoadCheckpoint, LoadModel
 from planning import BeamPlanner, Goal, Imagines, Planner, RandomPlanner
 from textocvp.checkpoint import CheckpointError
+from textocvp.protocols import LoadCheckpoint, LoadModel
 
 HORIZON = 24
 """Frames of an episode of the tabletop after the first one."""

@@ -13,49 +13,18 @@ import torch
 from joblib import Parallel, delayed
 
 from experiments.study.scenes import StudyScene
-from planning import Imagines
-from textocvp.protocols import load_model
-from textocvp.world_model import Checkpoint
+from textocvp.protocols import LoadCheckpoint as LoadCheckpoint
+from textocvp.protocols import LoadModel, SlotModel
 
 Out = TypeVar("Out", covariant=True)
 Model = TypeVar("Model")
-
-
-class StudyModel(Imagines, Protocol):
-    """A world model that knows where it came from."""
-
-    @property
-    def checkpoint(self) -> Checkpoint: ...
-
-    @property
-    def longest_horizon(self) -> int | None:
-        """How many frames it can imagine at once; None for any number."""
-        ...
-
-
-class LoadModel(Protocol):
-    """Makes a model. Hashable and equal for equal models, so that a process makes each only once."""
-
-    def __call__(self) -> Any: ...
-
-    def __hash__(self) -> int: ...
-
-
-@dataclass(frozen=True)
-class LoadCheckpoint:
-    """Loads a checkpoint of any architecture by its bundled name, folder or hub id."""
-
-    name: str
-
-    def __call__(self) -> Any:
-        return load_model(self.name)
 
 
 @dataclass
 class Worker:
     """What a unit of work may use, made once a process."""
 
-    world_model: StudyModel  # the study's own
+    world_model: SlotModel  # the study's own
     _environments: dict[int, gym.Env[Any, Any]] = field(default_factory=dict)
     _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
 

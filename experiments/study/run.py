@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import tyro
 
@@ -25,8 +25,9 @@ from experiments.report.tables import Table, TableSpec
 from experiments.study.frame_metrics import Measures
 from experiments.study.kept import KeptWork, file_digest, identity_of
 from experiments.study.methods import METHODS, find_models
-from experiments.study.pool import LoadCheckpoint, LoadModel, Pool, StudyModel, Unit, available_cores
+from experiments.study.pool import Pool, Unit, available_cores
 from textocvp.checkpoint import CheckpointError
+from textocvp.protocols import LoadCheckpoint, LoadModel, SlotModel
 
 RESULTS = Path("results")
 """Where every study writes by default."""
@@ -212,8 +213,8 @@ class Run:
         self.study, self.args = study, args
         self.folder = OutputFolder(args.folder(study.name))
         self.sizes = study.sizes(args) if sizes is None else sizes
-        self.load = load or LoadCheckpoint(args.checkpoint)
-        self.world_model: StudyModel = self.load()
+        self.load: LoadModel[Any] = load or LoadCheckpoint(args.checkpoint)
+        self.world_model = cast(SlotModel, self.load())
         if not hasattr(self.world_model, "rollout"):
             raise UsageError(f"{args.checkpoint} has no slots, and a study needs a model that has")
         longest = self.world_model.longest_horizon
