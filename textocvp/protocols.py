@@ -1,10 +1,15 @@
-"""What others may ask of a model, with slots or without, and how they get one."""
+"""What others may ask of a model, and how they get one.
+
+A `VideoModel` imagines frames, with slots or without. A `SlotModel` also gives its slots, as `WorldModel` does.
+Whatever has these methods is one, so a study that asks for no more also runs on a test double.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -12,11 +17,14 @@ from torch import Tensor
 
 from textocvp.baselines import BASELINES
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, read_json, resolve_checkpoint
+from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
+
+Model = TypeVar("Model", covariant=True)
 
 
 class VideoModel(Protocol):
-    """A video prediction model. Whatever has these methods is one, a test double too."""
+    """A video prediction model."""
 
     @property
     def checkpoint(self) -> Checkpoint:
@@ -44,6 +52,45 @@ class VideoModel(Protocol):
         Raises:
             TypeError, ValueError: as `WorldModel.rollout`.
         """
+
+
+class SlotModel(VideoModel, Protocol):
+    """A video prediction model with slots; its methods are described in `WorldModel`."""
+
+    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
+        """The slots of a true video (T, H, W, 3)."""
+
+    def rollout(
+        self,
+        obs: Mapping[str, Any] | np.ndarray | Rollout,
+        text: str | Sequence[str],
+        *,
+        horizon: int = 24,
+        seed: int = 0,
+        attention: bool = False,
+    ) -> Rollout:
+        """Imagine the next frames."""
+
+    def words(self, text: str) -> list[str]:
+        """What the last axis of `Rollout.attention` stands for."""
+
+
+class LoadModel(Protocol[Model]):
+    """Makes a model. Hashable, and equal for equal models, so that a process makes each only once."""
+
+    def __call__(self) -> Model: ...
+
+    def __hash__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class LoadCheckpoint:
+    """Loads any checkpoint, see `load_model`."""
+
+    name: str
+
+    def __call__(self) -> VideoModel:
+        return load_model(self.name)
 
 
 def load_model(
