@@ -145,7 +145,7 @@ def test_bundled_ones_may_be_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(name: str) -> None:
         raise CheckpointError(f"unknown checkpoint {name!r}")
 
-    monkeypatch.setattr("experiments.study.pool.load_model", nothing)
+    monkeypatch.setattr("textocvp.protocols.load_model", nothing)
     mage = METHODS["MAGE"]
     present, missing = find_models({"MAGE": LoadCheckpoint(mage.model), "Non-OC": LoadStill(None)})
     assert [(one.key, one.longest, one.slots) for one in present] == [("Non-OC", None, False)]
