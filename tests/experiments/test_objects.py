@@ -154,7 +154,7 @@ def not_there(name: str) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "results"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("experiments.study.pool.load_model", not_there)
+        patch.setattr("textocvp.protocols.load_model", not_there)
         args = StudyArgs(out=out, quick=True, workers=1)
         run(STUDY, args, load=LoadForesight("sees"), sizes=Sizes(scenes=2, clips=1, apart=1))
     return out
