@@ -4,14 +4,13 @@
     python experiments/all.py --quick            # first looks, about 7 minutes
     python experiments/all.py --only runtime --only long_horizon --fresh
 
-A study that is done is not run again while its options, the weights that it reads and the code are the same. One that
-fails is told on the page, the others are run all the same, and the exit status is 1. Writes a folder a study into
-`--out`, `index.html`, and `summary.md`: tables for the README, made from the `results.json` files.
+A study that is done is not run again while its options, weights and code are the same. One that fails is told on the
+page; the others are run all the same, and the exit status is 1. Writes a folder a study into `--out`, `index.html`, and
+`summary.md`: tables for the README.
 """
 
 from __future__ import annotations
 
-import os
 import shlex
 import subprocess
 import sys
@@ -27,14 +26,13 @@ from rich.console import Console
 from experiments.report.page import Entry, Index, Tone
 from experiments.report.results import Checkpoint, Results
 from experiments.report.tables import Cell, Table, TableRow
-from experiments.study.kept import ROOT
 from experiments.study.run import OutputFolder, Run, Study, StudyArgs, UsageError, exit_in_a_line
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
 NAMES = (
-    "controllability", "robustness", "prediction", "objects", "ablations", "interpretability", "runtime",
-    "long_horizon",
+    "controllability", "robustness", "prediction", "objects",
+    "ablations", "interpretability", "runtime", "long_horizon",
 )  # fmt: skip
 """Every study, in the order in which they are run and shown."""
 SHOWN = 5  # headline figures a study on the index page
@@ -60,7 +58,6 @@ class Args(StudyArgs):
 Outcome = tuple[str, Tone, str]
 """Of a study in this run: a word or two, their colour on the page, and what went wrong."""
 DONE: Outcome = ("done", "good", "")
-NOT_RUN: Outcome = ("not run", "plain", "")
 
 
 def main(
@@ -73,22 +70,19 @@ def main(
 
     Args:
         args: the command line.
-        execute: runs one study and returns what went wrong, or nothing; by default as a program of its own, so that
-            one that dies takes no other with it.
+        execute: runs one study and returns what went wrong, or nothing; by default `run_program`.
         studies: all there are, in order.
         load: makes the world model; by default loads `args.checkpoint`.
 
     Raises:
-        OSError, CheckpointError: if there is no folder or checkpoint, before any work is done.
-        UsageError: if there is no study of a name in `args.only`.
+        OSError, CheckpointError, UsageError: without folder, checkpoint or a study of that name; before any work.
     """
     studies = studies or [import_module(f"experiments.{name}").STUDY for name in NAMES]
-    known = [study.name for study in studies]
-    if wrong := [name for name in args.only if name not in known]:
-        raise UsageError(f"unknown study {wrong[0]!r}; known: {', '.join(known)}")
+    outcomes: dict[str, Outcome] = {study.name: ("not run", "plain", "") for study in studies}
+    if wrong := [name for name in args.only if name not in outcomes]:
+        raise UsageError(f"unknown study {wrong[0]!r}; known: {', '.join(outcomes)}")
     folder, console = OutputFolder(args.folder("")), Console()
     where = (load or LoadCheckpoint(args.checkpoint))().checkpoint
-    outcomes: dict[str, Outcome] = dict.fromkeys(known, NOT_RUN)
     for study in studies:
         wanted = not args.only or study.name in args.only
         if not (wanted and args.fresh) and is_done(study, args.of(study), load):
@@ -116,10 +110,10 @@ def is_done(study: Study, args: StudyArgs, load: LoadModel | None = None) -> boo
         return False
     try:
         this = Run(study, args, load=load)
-        same = (folder / "identity.txt").read_text().strip() == this.identity
+        written = (folder / "identity.txt").read_text().strip()
     except (OSError, UsageError, CheckpointError):  # the study itself will say so
         return False
-    return same and results.checkpoint == this.checkpoint
+    return (written, results.checkpoint) == (this.identity, this.checkpoint)
 
 
 def read_results(folder: Path) -> Results | None:
@@ -131,16 +125,12 @@ def read_results(folder: Path) -> Results | None:
 
 
 def run_program(study: Study, args: StudyArgs) -> str:
-    """Run `experiments/NAME.py` as a program; what it shows appears here."""
+    """Run a study as a program, so that one that dies takes no other with it; what it shows appears here."""
     command = [sys.executable, "-m", f"experiments.{study.name}", *shlex.split(" ".join(args.options()))]
     command += ["--out", str(args.folder(study.name)), "--workers", str(args.workers)]
-    path = os.pathsep.join(part for part in (str(ROOT), os.environ.get("PYTHONPATH", "")) if part)
     last: deque[str] = deque(maxlen=12)
-    with subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True, errors="replace"
-    ) as program:
-        assert program.stderr is not None
-        for line in program.stderr:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, errors="replace") as program:
+        for line in program.stderr or ():
             sys.stderr.write(line)
             last.append(line.rstrip())
     return "\n".join([f"exit status {program.returncode}", *last]) if program.returncode else ""
@@ -149,7 +139,7 @@ def run_program(study: Study, args: StudyArgs) -> str:
 def write_pages(
     folder: OutputFolder,
     args: Args,
-    checkpoint: Checkpoint,
+    weights: Checkpoint,
     studies: Sequence[Study],
     outcomes: Mapping[str, Outcome],
 ) -> None:
@@ -161,10 +151,10 @@ def write_pages(
         parts += [to_markdown(study, results)] if results else []
     index = Index(
         title="What was measured",
-        text="Every study has a page of its own, which opens offline: tables with 95 % intervals, plots, clips of the "
-        "best and of the worst cases, and the command that gives the same figures again.",
+        text="Every study has a page, which opens offline: tables with 95 % intervals, plots, clips of the best and "
+        "worst cases, and the command that gives the same figures again.",
         entries=entries,
-        checkpoint=checkpoint,
+        checkpoint=weights,
         command=replace(args, only=(), fresh=False).command("all"),
         quick=args.quick,
     )
@@ -176,35 +166,30 @@ def write_pages(
 def entry_of(study: Study, outcome: Outcome, results: Results | None) -> Entry:
     """A study's place on the page."""
     word, tone, problem = outcome
+    entry = Entry(study.title, study.question, word, tone, "no figures yet", problem=problem)
     if results is None:
-        return Entry(study.title, study.question, word, tone, "no figures yet", problem=problem)
+        return entry
     names = [name for name in dict.fromkeys([*study.first, *results.headline]) if name in results.headline]
-    detail = f"{len(results.rows)} figures in {results.seconds:.0f} s, {results.checkpoint.name}"
-    return Entry(
-        title=study.title,
-        question=study.question,
+    quick = ", a quick run" if results.quick else ""
+    return replace(
+        entry,
         state=word if outcome == DONE else f"{word}; figures of an earlier run",
-        tone=tone,
-        detail=detail + (", a quick run" if results.quick else ""),
+        detail=f"{len(results.rows)} figures in {results.seconds:.0f} s, {results.checkpoint.name}{quick}",
         figures=[(name.replace("_", " "), f"{results.headline[name]:.3g}") for name in names[:SHOWN]],
         report=f"{study.name}/report.html",
-        problem=problem,
     )
 
 
 def to_markdown(study: Study, results: Results) -> str:
     """A study's part of the summary: its tables, or its headline figures where none of the tables has a row."""
-    named = [
-        TableRow(name.replace("_", " "), [Cell(f"{value:g}")]) for name, value in results.headline.items()
-    ]
     tables = [spec.table(results.rows) for spec in study.tables]
+    named = [TableRow(key.replace("_", " "), [Cell(f"{value:g}")]) for key, value in results.headline.items()]
     shown = [table for table in tables if table.measured()[1]] or [Table("Figure", ["value"], named)]
-    lines = [f"### {study.title}", *(f"\n{table.to_markdown()}" for table in shown), ""]
+    weights = f"`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), 95 % intervals in brackets."
     quick = "**Quick run**: a first look, not the figures to quote. " if results.quick else ""
-    lines.append(
-        f"{quick}`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), 95 % intervals in brackets."
+    return "\n".join(
+        [f"### {study.title}", *(f"\n{its.to_markdown()}" for its in shown), "", quick + weights, ""]
     )
-    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -15,20 +15,21 @@ from experiments.robustness import (
     REPARSED,
     SPLITS,
     STUDY,
-    Figures,
     RobustOutcome,
     RobustScene,
     Sizes,
+    Values,
     bars_table,
+    by_name,
+    cases,
     difference_rows,
-    doubt,
+    drop,
     drop_difference,
     headline,
-    imagined_clips,
-    imagined_figures,
+    rows_of,
     verdict,
 )
-from experiments.study.frame_metrics import FrameScores, Measures
+from experiments.study.frame_metrics import Measures
 from experiments.study.methods import Model
 from experiments.study.pool import Worker
 from experiments.study.run import Run, ScenesArgs, run
@@ -41,50 +42,40 @@ BARE = Measures()
 STILL = Model("MAGE", LoadStill(), False, "still", "1" * 64, 12)
 
 
-def figures(metric: str, test: list[float], unseen: list[float]) -> Figures:
-    return Figures("ours", "9 frames", metric, {"test": np.array(test), "unseen_colors": np.array(unseen)})
+def values(test: list[float], unseen: list[float]) -> Values:
+    return {"test": np.array(test), "unseen_colors": np.array(unseen)}
 
 
 def test_a_drop_is_how_much_worse_a_figure_is() -> None:
     """.75 is a quarter less than 1; a distance of .06 is a fifth more than .05. Both are drops."""
-    success = figures("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0])
-    assert success.drop("unseen_colors").value == pytest.approx(0.25)  # type: ignore[union-attr]
-    distance = figures("st_lpips", [0.05, 0.05], [0.05, 0.07])
-    found = distance.drop("unseen_colors")
+    success = values([1, 1, 1, 1], [1, 1, 1, 0])
+    fallen = drop("closed_loop_success", success, "unseen_colors")
+    assert fallen is not None and fallen.value == pytest.approx(0.25)
+    found = drop("st_lpips", values([0.05, 0.05], [0.05, 0.07]), "unseen_colors")
     assert found is not None and found.value == pytest.approx(0.2)
     assert (found.low, found.high) == pytest.approx((0.0, 0.4)) and found.n == 2
-    better = figures("ssim", [0.8, 0.8], [0.88, 0.88]).drop("unseen_colors")
+    better = drop("ssim", values([0.8, 0.8], [0.88, 0.88]), "unseen_colors")
     assert better is not None and (better.low, better.value, better.high) == pytest.approx((-0.1,) * 3)
-    assert figures("iou", [0.0, 0.0], [0.5]).drop("unseen_colors") is None  # nothing to fall from
-    assert success.drop("more_objects") is None
+    assert drop("iou", values([0.0, 0.0], [0.5]), "unseen_colors") is None  # nothing to fall from
+    assert drop("closed_loop_success", success, "more_objects") is None
 
 
 def test_drops_are_compared_scene_by_scene() -> None:
     """Ours grows from .1 by a half and by nothing, MAGE by as much and a fifth more of its .2 in every scene."""
-    ours = figures("st_lpips", [0.1, 0.1], [0.15, 0.1])
-    mage = Figures(
-        "MAGE",
-        "9 frames",
-        "st_lpips",
-        {"test": np.array([0.2, 0.2]), "unseen_colors": np.array([0.34, 0.24])},
-    )
-    found = drop_difference(ours, mage, "unseen_colors")
+    ours, mage = values([0.1, 0.1], [0.15, 0.1]), values([0.2, 0.2], [0.34, 0.24])
+    found = drop_difference("st_lpips", ours, mage, "unseen_colors")
     assert found is not None and (found.low, found.value, found.high) == pytest.approx((-0.2,) * 3)
-    (row,) = difference_rows([ours, mage])
-    assert (row.method, row.split, row.metric) == (
-        "ours minus MAGE",
-        "unseen_colors",
-        "st_lpips_drop_difference",
-    )
-    ssim = figures("ssim", [0.8, 0.8], [0.6, 0.6])
-    other = figures("ssim", [0.8, 0.8], [0.4, 0.4])
-    difference = drop_difference(ssim, other, "unseen_colors")
+    place = "9 frames", "st_lpips"
+    (row,) = difference_rows({("ours", *place): ours, ("MAGE", *place): mage})
+    assert row.key == ("ours minus MAGE", "unseen_colors", "9 frames", "st_lpips_drop_difference")
+    ssim, other = values([0.8, 0.8], [0.6, 0.6]), values([0.8, 0.8], [0.4, 0.4])
+    difference = drop_difference("ssim", ssim, other, "unseen_colors")
     assert difference is not None and difference.value == pytest.approx(-0.25)
-    assert drop_difference(ours, figures("st_lpips", [0.1], [0.1]), "unseen_colors") is None
+    assert drop_difference("st_lpips", ours, values([0.1], [0.1]), "unseen_colors") is None
 
 
 def test_rows_of_a_figure() -> None:
-    rows = figures("closed_loop_success", [1, 1, 1, 1], [1, 1, 1, 0]).rows()
+    rows = rows_of(("ours", "9 frames", "closed_loop_success"), values([1, 1, 1, 1], [1, 1, 1, 0]))
     assert [(r.split, r.metric, r.n) for r in rows] == [
         ("test", "closed_loop_success", 4),
         ("unseen_colors", "closed_loop_success", 4),
@@ -95,11 +86,12 @@ def test_rows_of_a_figure() -> None:
 
 def outcome(split: str, number: int, ssim: float, good: bool) -> RobustOutcome:
     scene = study_scenes(split, number + 1, 0)[number]
-    scores = FrameScores("ours", {"ssim": np.full(24, ssim)}, {})
-    return RobustOutcome(scene, (scores,), {"ours": np.full(24, 0.5)}, {"ours": good})
+    return RobustOutcome(
+        scene, {"ours": {"ssim": np.full(24, ssim), "iou": np.full(24, 0.5)}}, {"ours": good}
+    )
 
 
-def test_worst_cases_are_failures_first_and_never_of_the_test_set() -> None:
+def test_worst_cases_are_failures_first_and_never_of_the_test_set(tmp_path: Path) -> None:
     outcomes = [
         outcome("test", 0, 0.1, False),
         outcome("unseen_colors", 0, 0.9, True),
@@ -107,16 +99,19 @@ def test_worst_cases_are_failures_first_and_never_of_the_test_set() -> None:
         outcome("more_objects", 0, 0.8, False),
         outcome("more_objects", 1, 0.7, True),
     ]
-    shown = [(p.best, p.scene.split, p.good) for p in imagined_clips(outcomes, (), BARE, 0, 2)]
+    sizes = Sizes(imagined=2, loop=0, controls=0, clips=2, acted=0)
+    this = Run(STUDY, ScenesArgs(out=tmp_path), load=LoadOracle(), sizes=sizes, loads={}, measures=BARE)
+    clips = cases(this, {"frames and masks": outcomes, "closed loop": []})["imagined clips"]
+    shown = [(clip.best, clip.scene.split, clip.good) for clip in clips]  # type: ignore[attr-defined]
     assert shown == [
         (True, "unseen_colors", True),
         (True, "more_objects", True),
         (False, "more_objects", False),
         (False, "unseen_colors", True),
     ]
-    found = {(c.metric, c.variant): c.values for c in imagined_figures(outcomes, ("ssim",))}
-    assert found["predicted_success", "whole episode"]["more_objects"].tolist() == [0.0, 1.0]
-    assert found["ssim", "19 frames"]["unseen_colors"] == pytest.approx([0.9, 0.2])
+    found = by_name((one.scene.split, one.figures()) for one in outcomes)
+    assert found["ours", "whole episode", "predicted_success"]["more_objects"].tolist() == [0.0, 1.0]
+    assert found["ours", "19 frames", "ssim"]["unseen_colors"] == pytest.approx([0.9, 0.2])
 
 
 def results(**figures: float) -> Results:
@@ -143,13 +138,12 @@ def test_a_verdict_that_the_interval_leaves_open_says_so(low: float, high: float
     value = (low + high) / 2
     row = Row("ours", "unseen_colors", "whole episode", "closed_loop_success", value, low, high, 8)
     study = Results("robustness", Checkpoint("a", ""), {}, {}, False, 1.0, [row], {BARS[0].name: value})
-    assert doubt(BARS[0], study, ST_LPIPS) == said
     cell = bars_table(study, ST_LPIPS).rows[0].cells[-1]
     assert cell.text == verdict(BARS[0], study) and cell.interval == said
 
 
 def test_without_a_learned_distance_its_headline_is_absent(tmp_path: Path) -> None:
-    rows = Figures("ours", "9 frames", "ssim", {"test": np.ones(2), "unseen_colors": np.ones(2)}).rows()
+    rows = rows_of(("ours", "9 frames", "ssim"), values([1, 1], [1, 1]))
     args = ScenesArgs(out=tmp_path)
     assert Run(STUDY, args, load=LoadOracle(), loads={}, measures=BARE).headline(rows) == {}
     with_it = Run(STUDY, args, load=LoadOracle(), loads={}, measures=ST_LPIPS)
@@ -165,9 +159,10 @@ def test_a_model_that_is_always_right_is_judged_right_with_and_without_its_own_m
         "ours": True, REPARSED: True, "true frames": True, "wrong text": False, "copy frame": True,
     }  # fmt: skip
     # The double's parser knows what happened whatever it is shown, so REPARSED and `copy frame` are right here too.
-    assert outcome.mean("ours", "iou", 19) is not None and outcome.mean("MAGE", "iou", 19) is None
-    assert len(outcome.scores[0].curves["ssim"]) == 19
-    assert len(outcome.ious["MAGE"]) == 12 and "MAGE" not in outcome.success
+    found = outcome.figures()
+    assert ("ours", "19 frames", "iou") in found and ("MAGE", "19 frames", "iou") not in found
+    assert len(outcome.curves["ours"]["ssim"]) == 19
+    assert len(outcome.curves["MAGE"]["iou"]) == 12 and "MAGE" not in outcome.success
 
 
 @pytest.fixture(scope="module")
