@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.checks import check_choice, check_range
 from envs.colors import COLORS, FLOOR_RGB, RGB, ROBOT_RGB, TABLE_RGB, palette
-from envs.factors import NO_FACTORS, Factors
+from envs.factors import NO_FACTORS, SHARES, Factors
 from envs.geometry import SIZES, SPAWN, TABLE, WORKSPACE, Box2, Sizes
 from envs.physics.arm import A2, A3, D1, D4, D5, D6, Arm, Paint, Point
 from envs.physics.camera import PRESETS, CameraPreset
@@ -194,7 +194,7 @@ def make_setup(
     """The setup of a scene's name with some of it replaced; see `TabletopEnv` for the arguments.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: for an unknown name, or factors that the scene cannot have.
     """
     check_choice("scene", scene, SCENES)
     setup = SCENES[scene]
@@ -204,5 +204,7 @@ def make_setup(
     if sizes is not None:
         check_choice("sizes", sizes, SIZES)
         setup = replace(setup, sizes=SIZES[sizes])
+    if factors is not None and not setup.crowded and any(getattr(factors, name) for name in SHARES):
+        raise ValueError(f"the scene {scene!r} has no {', '.join(SHARES)}: set these factors to 0")
     check_range("object_scale", object_scale, 0.5, 1.0)
     return replace(setup, sizes=setup.sizes.scaled(object_scale), factors=factors or setup.factors)

@@ -194,6 +194,16 @@ def test_wrong_ranges_are_refused(change: dict[str, Any], message: str) -> None:
         replace(Factors(), **change)
 
 
+def test_the_simple_scene_can_have_another_light_but_no_crowd(make: Make) -> None:
+    env = make(image_size=32, factors=replace(NO_FACTORS, ambient=(0.3, 0.3)))
+    dark, info = env.reset(seed=1)
+    plain, _ = make(image_size=32).reset(seed=1)
+    darker = dark["rgb"].astype(int) - plain["rgb"]
+    assert (darker[info["segmentation"] > 0] < 0).all() and not darker[info["segmentation"] == 0].any()
+    with pytest.raises(ValueError, match="the scene 'simple' has no same_color"):
+        gym.make("PutBlockInBowl-v0", factors=Factors())
+
+
 @pytest.mark.parametrize(
     ("factors", "message"),
     [
