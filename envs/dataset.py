@@ -33,8 +33,7 @@ from envs.tasks import TASKS, Question
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
 
-EPISODES_PER_PIECE = 50
-"""A kill costs each worker at most the piece it is at: a few seconds."""
+EPISODES_PER_PIECE = 50  # a kill costs each worker at most the piece it is at: a few seconds
 
 EPISODES_PER_MERGE = 500
 
@@ -52,8 +51,7 @@ class EpisodeConfig:
     split: str
     scene: str = "simple"
     image_size: int = 64
-    camera: str | None = None
-    """None, as for the next two and the factors: the scene's own."""
+    camera: str | None = None  # None, as for the next two and the factors: the scene's own
     sizes: str | None = None
     physics_hz: int | None = None
     factors: Factors | None = None
@@ -77,12 +75,10 @@ class RecordedEpisode:
 
     seed: int
     instruction: str
-    objects: tuple[dict[str, Any], ...]
-    """By id; each with `id`, `label`, `kind` and `color`."""
+    objects: tuple[dict[str, Any], ...]  # by id; each with `id`, `label`, `kind` and `color`
     questions: tuple[Question, ...]
     success: bool
-    factors: dict[str, Any]
-    """Values of this scene's factors."""
+    factors: dict[str, Any]  # values of this scene's factors
     arrays: dict[str, NDArray[Any]]
     """The arrays over frames (T, ...), named as in the file, without padding for objects."""
 
@@ -118,8 +114,7 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
 
 # -- The file ----------------------------------------------------------------------------------------------
 
-SIDE = -1
-"""Stands for the image size in the shapes below."""
+SIDE = -1  # stands for the image size in the shapes below
 
 # Name -> shape of a frame's value, type, frames in a chunk, compression. Flat colours pack so well that gzip at
 # its fastest reads faster than lzf, at half the size (measured).

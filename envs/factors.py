@@ -37,43 +37,32 @@ class Factors:
         ValueError: for a range that is none.
     """
 
-    light_tilt: Range | None = (0.0, 50.0)
-    """Degrees between the light and the vertical."""
+    light_tilt: Range | None = (0.0, 50.0)  # degrees between the light and the vertical
     light_turn: Range | None = (-180.0, 180.0)
     """Degrees by which the light is turned about the vertical, from +x to +y."""
-    ambient: Range | None = (0.45, 0.75)
-    """Strength of the light that comes from everywhere."""
-    diffuse: Range | None = (0.2, 0.5)
-    """Strength of the light from one direction, on a surface that faces it."""
+    ambient: Range | None = (0.45, 0.75)  # strength of the light that comes from everywhere
+    diffuse: Range | None = (0.2, 0.5)  # strength of the light from one direction, on a surface that faces it
     specular: Range | None = (0.0, 0.1)
-    table_gray: Range | None = (20.0, 120.0)
-    """Of 255, as are the following."""
+    table_gray: Range | None = (20.0, 120.0)  # of 255, as are the following
     floor_gray: Range | None = (110.0, 250.0)
     arm_dark: Range | None = (20.0, 75.0)
     arm_light: Range | None = (90.0, 230.0)
-    tint: Range | None = (-12.0, 12.0)
-    """Added to each channel of table, floor and both grays of the arm."""
-    object_gain: Range | None = (0.8, 1.1)
-    """Factor of each object's colour."""
-    object_tint: Range | None = (-15.0, 15.0)
-    """Added to each channel of each object's colour."""
-    block: Range | None = (0.038, 0.064)
-    """Edge of the blocks, metres."""
+    tint: Range | None = (-12.0, 12.0)  # added to each channel of table, floor and both grays of the arm
+    object_gain: Range | None = (0.8, 1.1)  # factor of each object's colour
+    object_tint: Range | None = (-15.0, 15.0)  # added to each channel of each object's colour
+    block: Range | None = (0.038, 0.064)  # edge of the blocks, metres
     bowl: Range | None = (0.11, 0.15)
     """Diameter of the bowls, metres, to a millimetre; more where a block could not lie in them."""
     camera_shift: Range | None = (-0.02, 0.02)
     """Metres by which the camera's place and the point that it looks at move along each axis; 1 cm is about
     2 pixels at 336x336."""
-    camera_zoom: Range | None = (-1.0, 1.0)
-    """Degrees added to the field of view."""
+    camera_zoom: Range | None = (-1.0, 1.0)  # degrees added to the field of view
     same_color: float = 0.35
     """Share of the scenes in which several objects may have one colour (no named thing has a double)."""
-    in_bowl: float = 0.2
-    """Share of the scenes in which another block starts in another bowl, if it can."""
+    in_bowl: float = 0.2  # share of the scenes in which another block starts in another bowl, if it can
     on_block: float = 0.2
     """Share of the scenes in which a block starts on another, which is not named, if it can."""
-    carried: float = 0.15
-    """Share of the scenes in which the arm holds the first named block at the start."""
+    carried: float = 0.15  # share of the scenes in which the arm holds the first named block at the start
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -144,8 +133,7 @@ class Factors:
         return replace(scene, objects=tuple(objects))
 
 
-FACTORS = tuple(field.name for field in fields(Factors))
-"""Names of all factors."""
+FACTORS = tuple(field.name for field in fields(Factors))  # names of all factors
 
 NO_FACTORS = Factors().without(FACTORS)
 

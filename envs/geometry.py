@@ -37,8 +37,7 @@ SPAWN = Box2(x=(0.345, 0.705), y=(-0.16, 0.16))
 """Where the centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting
 arm."""
 
-TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))
-"""The table top."""
+TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))  # the table top
 
 
 BLOCK_MASS, BOWL_MASS = 0.02, 0.2
@@ -53,19 +52,14 @@ class Sizes:
     4 cm and 11.4 cm).
     """
 
-    block: float = 0.058
-    """Edge of a block."""
-    bowl_radius: float = 0.069
-    """Outer radius at the rim."""
-    bowl_inner_radius: float = 0.064
-    """Inner radius at the rim."""
+    block: float = 0.058  # edge of a block
+    bowl_radius: float = 0.069  # outer radius at the rim
+    bowl_inner_radius: float = 0.064  # inner radius at the rim
     bowl_floor_radius: float = 0.048
     """Inner radius at the floor: wider than half a block's diagonal, so that a block can lie flat."""
-    bowl_foot_radius: float = 0.052
-    """Outer radius where the bowl stands on the table."""
+    bowl_foot_radius: float = 0.052  # outer radius where the bowl stands on the table
     bowl_height: float = 0.046
-    bowl_floor: float = 0.006
-    """Thickness of the floor."""
+    bowl_floor: float = 0.006  # thickness of the floor
 
     def scaled(self, factor: float) -> Sizes:
         """All of them times ``factor``."""

@@ -34,8 +34,7 @@ class ResetOptions:
     arm_start: str | Joints
     request: SceneRequest
     setup: Setup
-    factors: dict[str, Any] | None
-    """Values to use instead of random ones."""
+    factors: dict[str, Any] | None  # values to use instead of random ones
 
     def draw(self, rng: np.random.Generator) -> tuple[Setup, dict[str, Any], Scene, Joints]:
         """What to build: the setup, the values of its factors, the scene, and the arm's joint angles."""

@@ -16,8 +16,7 @@ MAX_BOWLS = 5
 MAX_TRIES = 5000
 """Whole layouts to try. The fullest allowed scene needs about 100 (at most 516 in 60 seeds), at 0.3 ms each."""
 
-ARM_JITTER = 0.08
-"""Half-width in radians of the random joint offsets of a perturbed start pose."""
+ARM_JITTER = 0.08  # half-width in radians of the random joint offsets of a perturbed start pose
 
 
 @dataclass(frozen=True)
@@ -31,20 +30,14 @@ class SceneRequest:
     named: tuple[str, ...]
     """Kinds of the things that the instruction names, in its order: thing, target, thing, target, ..."""
     n_objects: int = 6
-    n_bowls: int | None = None
-    """Number of bowls; uniform over the possible numbers when None."""
-    color_split: ColorSplit = "seen"
-    """Which colours the instruction may name."""
-    instructions: tuple[Instruction, ...] | None = None
-    """What the instruction asks for; drawn when None."""
+    n_bowls: int | None = None  # number of bowls; uniform over the possible numbers when None
+    color_split: ColorSplit = "seen"  # which colours the instruction may name
+    instructions: tuple[Instruction, ...] | None = None  # what the instruction asks for; drawn when None
     blocks_in_bowls: int = 0
     """How many blocks that the instruction does not name start in bowls that it does not name."""
-    target_in_bowl: bool = False
-    """Whether the first named block starts in a bowl that is not named."""
-    spawn: Box2 = SPAWN
-    """Where objects stand."""
-    edge: float = 0.0
-    """How far from the edge of that area their centres are, in footprints."""
+    target_in_bowl: bool = False  # whether the first named block starts in a bowl that is not named
+    spawn: Box2 = SPAWN  # where objects stand
+    edge: float = 0.0  # how far from the edge of that area their centres are, in footprints
 
     def __post_init__(self) -> None:
         if not len(self.named) <= self.n_objects <= MAX_OBJECTS:

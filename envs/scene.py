@@ -13,8 +13,7 @@ from envs.colors import COLORS
 from envs.geometry import Box2, Sizes
 
 KINDS = ("block", "bowl")
-MAX_OBJECTS = 8
-"""As many objects as fit side by side into the workspace, each visible."""
+MAX_OBJECTS = 8  # as many objects as fit side by side into the workspace, each visible
 
 
 HELD_HEIGHT = 2.5
@@ -64,10 +63,8 @@ class ObjectSpec:
     y: float
     yaw: float = 0.0
     inside: int | None = None
-    on: int | None = None
-    """The id of the block that a block stands on."""
-    height: float | None = None
-    """Of a block's centre (metres), if the arm holds it."""
+    on: int | None = None  # the id of the block that a block stands on
+    height: float | None = None  # of a block's centre (metres), if the arm holds it
 
     @property
     def thing(self) -> Thing:
@@ -85,8 +82,7 @@ class Scene:
 
     objects: tuple[ObjectSpec, ...]
     goal: tuple[GoalPair, ...]
-    instruction: str
-    """The sentence that asks for the goal."""
+    instruction: str  # the sentence that asks for the goal
 
     @property
     def held(self) -> int:

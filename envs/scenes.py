@@ -22,8 +22,7 @@ from envs.scene import MAX_OBJECTS
 class Light:
     """One lamp far away, and light from everywhere. Faces away from the lamp have only the latter."""
 
-    direction: Point
-    """Towards the lamp."""
+    direction: Point  # towards the lamp
     ambient: float
     diffuse: float
     specular: float = 0.0
@@ -33,8 +32,7 @@ class Light:
 class Motion:
     """How a pick-and-place moves."""
 
-    pick_height: float
-    """Height of the tip over the place to pick, before and after, in metres."""
+    pick_height: float  # height of the tip over the place to pick, before and after, in metres
     place_height: float
     descent_speed: float
     """In m/s. Contact must fall well inside a frame, for blocks on the table and in bowls."""
@@ -48,16 +46,11 @@ class Setup:
     """Everything of a scene but its objects."""
 
     camera: CameraPreset
-    physics_hz: int
-    """Physics steps per second, unless the user asks for others."""
-    table: Box2
-    """The table top that is seen."""
-    workspace: Box2
-    """Where a primitive may pick and place."""
-    spawn: Box2
-    """Where objects stand at the start."""
-    edge: float
-    """How far from the spawn area's edge, in footprints."""
+    physics_hz: int  # physics steps per second, unless the user asks for others
+    table: Box2  # the table top that is seen
+    workspace: Box2  # where a primitive may pick and place
+    spawn: Box2  # where objects stand at the start
+    edge: float  # how far from the spawn area's edge, in footprints
     arm: Arm
     motion: Motion
     light: Light
@@ -68,8 +61,7 @@ class Setup:
     """By id, the factor of an object's colour and what is added to it."""
     round_bowls: bool = False
     """Whether bowls look round inside and outside instead of conical. They feel the same."""
-    oversampling: int = 1
-    """Frames are drawn this many times larger along each axis and averaged."""
+    oversampling: int = 1  # frames are drawn this many times larger along each axis and averaged
     crowded: bool = False
     """Whether objects may share a colour, stand on each other, and hang at the arm at the start."""
     factors: Factors = NO_FACTORS

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from envs.geometry import Box2
 from envs.physics.motion import MAX_SPEED, MAX_TURN
 
-EXTRAS = ("depth", "segmentation", "proprio")
-"""Observations beside `rgb` and `instruction`, on request."""
+EXTRAS = ("depth", "segmentation", "proprio")  # observations beside `rgb` and `instruction`, on request
 
 CHARSET = string.ascii_lowercase + " "
 """Characters an instruction is made of. Gymnasium's default charset for ``Text`` lacks the space."""

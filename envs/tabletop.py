@@ -25,8 +25,7 @@ from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primi
 from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
-EE_SECONDS = 5.0
-"""Time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s."""
+EE_SECONDS = 5.0  # time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s
 
 MAX_SETTLE_STEPS = 120
 HOME_TOLERANCE = 0.02

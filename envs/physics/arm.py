@@ -21,11 +21,9 @@ Point = tuple[float, float, float]
 D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823
 SHOULDER_OFFSET, ELBOW_OFFSET = 0.13585, 0.1197
 
-TOOL = 0.10
-"""Length of the plain arm's suction gripper below the flange."""
+TOOL = 0.10  # length of the plain arm's suction gripper below the flange
 
-TIP_RADIUS = 0.018
-"""Radius of the suction cup."""
+TIP_RADIUS = 0.018  # radius of the suction cup
 
 FLANGE_RADIUS = 0.040
 
@@ -35,18 +33,15 @@ GRIPPER = ((0.0382, 0.047, -0.0115), (0.0145, 0.055, -0.0625), (0.007, 0.02, -0.
 CUP_RGB: RGB = (55, 140, 215)
 FOOT_RGB: RGB = (218, 218, 218)
 
-TIP_LINK = 6
-"""Index of the link that carries the suction cup; its frame is the tip itself."""
+TIP_LINK = 6  # index of the link that carries the suction cup; its frame is the tip itself
 
 
 @dataclass(frozen=True)
 class Paint:
     """The two grays that a UR5 mostly has, RGB in 0..255."""
 
-    dark: RGB = (50, 50, 50)
-    """Shoulder, forearm, second wrist and gripper."""
-    light: RGB = (203, 203, 203)
-    """Upper arm, first and third wrist."""
+    dark: RGB = (50, 50, 50)  # shoulder, forearm, second wrist and gripper
+    light: RGB = (203, 203, 203)  # upper arm, first and third wrist
 
     @property
     def links(self) -> tuple[RGB, ...]:
@@ -59,15 +54,12 @@ class Paint:
 class Arm:
     """How an arm is built and where its tip may be, in metres."""
 
-    home: Point
-    """Where the tip rests."""
+    home: Point  # where the tip rests
     reach_low: Point
     reach_high: Point
     """The tip's commanded place is kept within these corners, and within the arm's own reach."""
-    tool: float = TOOL
-    """Length of the suction gripper below the flange."""
-    paint: Paint | None = None
-    """None: a plain arm of cylinders in `ROBOT_RGB`."""
+    tool: float = TOOL  # length of the suction gripper below the flange
+    paint: Paint | None = None  # None: a plain arm of cylinders in `ROBOT_RGB`
 
     @property
     def home_joints(self) -> Joints:

@@ -15,10 +15,8 @@ class CameraPreset:
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
-    fov: float
-    """Vertical field of view."""
-    aspect: float = 1.0
-    """Tangent of half the horizontal field of view over that of the vertical one."""
+    fov: float  # vertical field of view
+    aspect: float = 1.0  # tangent of half the horizontal field of view over that of the vertical one
     near: float = 0.1
     far: float = 10.0
 

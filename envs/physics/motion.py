@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 
 from envs.physics.robot import Robot
 
-Action = NDArray[np.float32]
-"""(5,): dx, dy, dz in metres, dyaw in radians, suction (on above 0.5)."""
+Action = NDArray[np.float32]  # (5,): dx, dy, dz in metres, dyaw in radians, suction (on above 0.5)
 
 CLEARANCE = 0.018
 """How much higher than at the pick the tip lets go, in metres: over the bowl's floor, below its rim."""
 
-MAX_SPEED = 3.0
-"""Fastest motion of the tip along an axis, in m/s."""
+MAX_SPEED = 3.0  # fastest motion of the tip along an axis, in m/s
 
-MAX_TURN = 8.0
-"""Fastest turn of the tip, in rad/s."""
+MAX_TURN = 8.0  # fastest turn of the tip, in rad/s
 
 CLEAR = 0.06
 """With joints at constant speed: how far the tip rises straight up first, in metres, out of a bowl."""

@@ -15,23 +15,18 @@ from numpy.typing import NDArray
 from envs.physics.arm import TIP_LINK, Joints, Point
 from envs.physics.simulation import Tabletop
 
-CONTACT = 0.002
-"""Gap in metres at which the suction cup seals, and at which a downward motion stops."""
+CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops
 
-FORCE = 400.0
-"""Motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject."""
+FORCE = 400.0  # motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject
 
 
 @dataclass(frozen=True)
 class GripperState:
     """What the gripper is doing."""
 
-    position: Point
-    """The tip, in metres."""
-    yaw: float
-    """Radians."""
-    holding: int
-    """Id of the held object, or -1."""
+    position: Point  # the tip, in metres
+    yaw: float  # radians
+    holding: int  # id of the held object, or -1
 
 
 class Robot:

@@ -13,14 +13,11 @@ from pathlib import Path
 
 from envs.geometry import Sizes
 
-SEGMENTS = 24
-"""Corners of the bowl's circle as seen."""
+SEGMENTS = 24  # corners of the bowl's circle as seen
 
-ARC = 5
-"""Bands of a round wall."""
+ARC = 5  # bands of a round wall
 
-STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))
-"""Normals (outward, upward) around a round bowl's floor."""
+STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
 
 WALL_PARTS = 12
 """Convex parts of the bowl's wall as felt: one per wall segment. A block's edge never meets their corners."""

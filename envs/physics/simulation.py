@@ -26,18 +26,15 @@ TABLE_THICKNESS = 0.04
 LABELS = {"background": 0, "robot": 1}
 """Labels of a segmentation that every scene has: table and floor, and the robot."""
 
-FIRST_OBJECT = 2
-"""Object i has the label FIRST_OBJECT + i."""
+FIRST_OBJECT = 2  # object i has the label FIRST_OBJECT + i
 
 
 @dataclass(frozen=True)
 class Image:
     """One camera frame of size H = W."""
 
-    rgb: NDArray[np.uint8]
-    """(H, W, 3), 0..255."""
-    segmentation: NDArray[np.uint8]
-    """(H, W): 0 table and floor, 1 arm, 2 + i object i."""
+    rgb: NDArray[np.uint8]  # (H, W, 3), 0..255
+    segmentation: NDArray[np.uint8]  # (H, W): 0 table and floor, 1 arm, 2 + i object i
     depth: NDArray[np.float32]
     """(H, W), metres along the optical axis; the camera's far distance where nothing is."""
 

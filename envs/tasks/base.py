@@ -29,10 +29,8 @@ class Question(NamedTuple):
     """A sentence of one step that a scene allows."""
 
     text: str
-    moves: int
-    """Id of the object that should move."""
-    ends_at: int
-    """Id of the object at which it should end."""
+    moves: int  # id of the object that should move
+    ends_at: int  # id of the object at which it should end
 
 
 class Relation(ABC):
@@ -41,12 +39,9 @@ class Relation(ABC):
     The expert picks at the thing and lets go at `place`.
     """
 
-    name: ClassVar[str]
-    """The words between thing and target, such as "in"."""
-    kinds: ClassVar[tuple[str, str]]
-    """Kinds of the thing, which moves, and of the target, at which it ends."""
-    exclusive: ClassVar[bool] = False
-    """Whether a target has room for one thing only."""
+    name: ClassVar[str]  # the words between thing and target, such as "in"
+    kinds: ClassVar[tuple[str, str]]  # kinds of the thing, which moves, and of the target, at which it ends
+    exclusive: ClassVar[bool] = False  # whether a target has room for one thing only
 
     def between(self, thing_color: str, target_color: str) -> Instruction:
         """The instruction that asks for it."""
