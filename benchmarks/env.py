@@ -107,9 +107,9 @@ def _mean_ms(call: Any, times: int) -> float:
 def _add_dense_arm(world: Any, mesh: Path) -> None:
     """Stand dense links where the arm works; they touch nothing."""
     for link in range(LINKS):
-        shape = p.createVisualShape(p.GEOM_MESH, fileName=str(mesh), physicsClientId=world.client)
+        shape = world.bullet.createVisualShape(p.GEOM_MESH, fileName=str(mesh))
         place = [0.05 + 0.05 * link, 0.0, 0.25]
-        p.createMultiBody(0, -1, shape, place, physicsClientId=world.client)
+        world.bullet.createMultiBody(0, -1, shape, place)
     world._label = np.append(world._label, np.ones(LINKS, dtype=np.uint8))
 
 

@@ -32,9 +32,7 @@ from envs.tasks import TASKS, Question
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
-
 EPISODES_PER_PIECE = 50  # a kill costs each worker at most the piece it is at: a few seconds
-
 EPISODES_PER_MERGE = 500
 
 FRAMES_PER_CHUNK = 4

@@ -134,7 +134,6 @@ class Factors:
 
 
 FACTORS = tuple(field.name for field in fields(Factors))  # names of all factors
-
 NO_FACTORS = Factors().without(FACTORS)
 
 

@@ -26,7 +26,6 @@ from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
 EE_SECONDS = 5.0  # time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s
-
 MAX_SETTLE_STEPS = 120
 HOME_TOLERANCE = 0.02
 """How close to its resting place, in metres, the arm must be for a solved episode to end."""

@@ -20,11 +20,8 @@ Point = tuple[float, float, float]
 # Universal Robots' published lengths of the UR5, in metres.
 D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823
 SHOULDER_OFFSET, ELBOW_OFFSET = 0.13585, 0.1197
-
 TOOL = 0.10  # length of the plain arm's suction gripper below the flange
-
 TIP_RADIUS = 0.018  # radius of the suction cup
-
 FLANGE_RADIUS = 0.040
 
 GRIPPER = ((0.0382, 0.047, -0.0115), (0.0145, 0.055, -0.0625), (0.007, 0.02, -0.10))
@@ -32,7 +29,6 @@ GRIPPER = ((0.0382, 0.047, -0.0115), (0.0145, 0.055, -0.0625), (0.007, 0.02, -0.
 
 CUP_RGB: RGB = (55, 140, 215)
 FOOT_RGB: RGB = (218, 218, 218)
-
 TIP_LINK = 6  # index of the link that carries the suction cup; its frame is the tip itself
 
 
@@ -44,10 +40,10 @@ class Paint:
     light: RGB = (203, 203, 203)  # upper arm, first and third wrist
 
     @property
-    def links(self) -> tuple[RGB, ...]:
-        """By index of the link; the base, which PyBullet counts as -1, is the last."""
+    def links(self) -> dict[int, RGB]:
+        """By PyBullet's index of the link; the base is -1."""
         dark, light = self.dark, self.light
-        return dark, light, dark, light, dark, light, CUP_RGB, dark, FOOT_RGB
+        return {0: dark, 1: light, 2: dark, 3: light, 4: dark, 5: light, 6: CUP_RGB, 7: dark, -1: FOOT_RGB}
 
 
 @dataclass(frozen=True)
@@ -120,28 +116,39 @@ def arm_urdf(arm: Arm) -> str:
     """
     tool_z = -D6 - arm.tool
     looks = {
-        "base": [_cylinder(0.075, D1 + 0.05, (0, 0, D1 / 2 - 0.02))],
-        "shoulder": [_cylinder(0.06, SHOULDER_OFFSET + 0.06, (0, SHOULDER_OFFSET / 2, 0), along="y")],
-        "upper_arm": [_cylinder(0.055, A2, (A2 / 2, 0, 0), along="x")],
-        "forearm": [_cylinder(0.045, A3, (A3 / 2, 0, 0), along="x")],
-        "wrist1": [_cylinder(0.04, 0.12, (0, 0, 0), along="y")],
-        "wrist2": [_cylinder(0.04, D5 + 0.04, (D5 / 2 + 0.01, 0, 0), along="x")],
-        "gripper": [
-            _cylinder(FLANGE_RADIUS, D6 + 0.045, (0, 0, tool_z + arm.tool - 0.005 + (D6 + 0.045) / 2 - 0.04))
-        ],
+        "base": _cylinder(0.075, D1 + 0.05, (0, 0, D1 / 2 - 0.02)),
+        "shoulder": _cylinder(0.06, SHOULDER_OFFSET + 0.06, (0, SHOULDER_OFFSET / 2, 0), along="y"),
+        "upper_arm": _cylinder(0.055, A2, (A2 / 2, 0, 0), along="x"),
+        "forearm": _cylinder(0.045, A3, (A3 / 2, 0, 0), along="x"),
+        "wrist1": _cylinder(0.04, 0.12, (0, 0, 0), along="y"),
+        "wrist2": _cylinder(0.04, D5 + 0.04, (D5 / 2 + 0.01, 0, 0), along="x"),
+        "gripper": _cylinder(
+            FLANGE_RADIUS, D6 + 0.045, (0, 0, tool_z + arm.tool - 0.005 + (D6 + 0.045) / 2 - 0.04)
+        ),
     }
-    cup, tool, tool_joint = [], [], []
+    links, joints = [], []
     if arm.paint is None:
-        looks["gripper"].append(_cylinder(0.027, arm.tool, (0, 0, tool_z + arm.tool / 2 + 0.003)))
+        looks["gripper"] += _cylinder(0.027, arm.tool, (0, 0, tool_z + arm.tool / 2 + 0.003))
+        cup = ""
     else:
-        looks |= {name: [_mesh(path)] for name, path in ur5_meshes().items()}
-        cup = [_cylinder(0.0095, 0.016, (0, 0, 0.0025))]
-        parts = [_cylinder(r, length, (0, 0, z - D6)) for r, length, z in GRIPPER]
-        tool, tool_joint = [_link("tool", 0.01, parts)], [_fixed("tool", 0.0)]
+        for name, path in ur5_meshes().items():
+            looks[name] = f'<visual><geometry><mesh filename="{path}"/></geometry></visual>'
+        cup = _cylinder(0.0095, 0.016, (0, 0, 0.0025))
+        parts = [_cylinder(radius, length, (0, 0, z - D6)) for radius, length, z in GRIPPER]
+        links, joints = (
+            [_link("tool", 0.01, "".join(parts))],
+            [_joint("tool", "gripper", "tool", (0, 0, 0.0))],
+        )
+    cup += (
+        '<collision><origin xyz="0 0 0.005"/>'
+        f'<geometry><cylinder radius="{TIP_RADIUS}" length="0.01"/></geometry></collision>'
+    )
     masses = (2.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.2)
-    links = [_link(name, mass, looks[name]) for name, mass in zip(looks, masses, strict=True)]
-    contact = f'<cylinder radius="{TIP_RADIUS}" length="0.01"/>'
-    links += [_link("tip", 0.01, cup, contact=contact, contact_z=0.005), *tool]
+    links = [
+        *(_link(name, mass, looks[name]) for name, mass in zip(looks, masses, strict=True)),
+        _link("tip", 0.01, cup),
+        *links,
+    ]
     joints = [
         _joint("pan", "base", "shoulder", (0, 0, D1), "0 0 1"),
         _joint("lift", "shoulder", "upper_arm", (0, SHOULDER_OFFSET, 0), "0 1 0"),
@@ -149,35 +156,18 @@ def arm_urdf(arm: Arm) -> str:
         _joint("wrist1", "forearm", "wrist1", (A3, D4 - SHOULDER_OFFSET + ELBOW_OFFSET, 0), "0 1 0"),
         _joint("wrist2", "wrist1", "wrist2", (0, 0, 0), "1 0 0"),
         _joint("wrist3", "wrist2", "gripper", (D5, 0, 0), "0 0 1"),
-        _fixed("tip", tool_z),
-        *tool_joint,
+        _joint("tip", "gripper", "tip", (0, 0, tool_z)),
+        *joints,
     ]
     text = '<?xml version="1.0"?>\n<robot name="arm">\n' + "\n".join(links + joints) + "\n</robot>\n"
     return generated_file("arm", ".urdf", text)
 
 
-def _fixed(name: str, z: float) -> str:
-    return (
-        f'<joint name="{name}" type="fixed"><parent link="gripper"/><child link="{name}"/>'
-        f'<origin xyz="0 0 {z}"/></joint>'
-    )
-
-
-def _mesh(path: str) -> str:
-    return f'<visual><geometry><mesh filename="{path}"/></geometry></visual>'
-
-
-def _link(name: str, mass: float, visuals: list[str], contact: str = "", contact_z: float = 0.0) -> str:
+def _link(name: str, mass: float, shapes: str) -> str:
     inertia = mass * 0.01
     tensor = f'ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"'
-    touch = (
-        f'<collision><origin xyz="0 0 {contact_z}"/><geometry>{contact}</geometry></collision>'
-        if contact
-        else ""
-    )
     return (
-        f'<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial>'
-        f"{''.join(visuals)}{touch}</link>"
+        f'<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial>{shapes}</link>'
     )
 
 
@@ -191,9 +181,12 @@ def _cylinder(radius: float, length: float, center: Point, along: str = "z") -> 
     )
 
 
-def _joint(name: str, parent: str, child: str, origin: Point, axis: str) -> str:
+def _joint(name: str, parent: str, child: str, origin: Point, axis: str = "") -> str:
+    """A joint that turns about ``axis``, or is fixed."""
+    kind = "revolute" if axis else "fixed"
+    turning = f'<axis xyz="{axis}"/><limit lower="-6.3" upper="6.3" effort="1000" velocity="20"/>'
     return (
-        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{origin[0]} {origin[1]} {origin[2]}"/><axis xyz="{axis}"/>'
-        f'<limit lower="-6.3" upper="6.3" effort="1000" velocity="20"/></joint>'
+        f'<joint name="{name}" type="{kind}">'
+        f'<parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin[0]} {origin[1]} {origin[2]}"/>{turning if axis else ""}</joint>'
     )

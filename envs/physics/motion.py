@@ -20,7 +20,6 @@ CLEARANCE = 0.018
 """How much higher than at the pick the tip lets go, in metres: over the bowl's floor, below its rim."""
 
 MAX_SPEED = 3.0  # fastest motion of the tip along an axis, in m/s
-
 MAX_TURN = 8.0  # fastest turn of the tip, in rad/s
 
 CLEAR = 0.06

@@ -16,7 +16,6 @@ from envs.physics.arm import TIP_LINK, Joints, Point
 from envs.physics.simulation import Tabletop
 
 CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops
-
 FORCE = 400.0  # motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject
 
 
@@ -88,19 +87,19 @@ class Robot:
 
     def state(self) -> GripperState:
         """Where the tip really is, and what it holds."""
-        position = p.getLinkState(self.world.arm, TIP_LINK, physicsClientId=self.world.client)[4]
+        position = self.world.bullet.getLinkState(self.world.arm, TIP_LINK)[4]
         return GripperState(position, self.yaw, self.holding)
 
     def joints(self) -> NDArray[np.float64]:
         """Joint angles (6,) in radians."""
-        states = p.getJointStates(self.world.arm, self._joints, physicsClientId=self.world.client)
+        states = self.world.bullet.getJointStates(self.world.arm, self._joints)
         return np.array([state[0] for state in states])
 
     def _drive(self, angles: NDArray[np.float64]) -> None:
         # Wrist3 may take the short way round only at ±pi, which a change of 2 pi would spoil.
         change = (angles - self._angles + pi) % (2 * pi) - pi
         angles = self._angles + change
-        p.setJointMotorControlArray(
+        self.world.bullet.setJointMotorControlArray(
             self.world.arm,
             self._joints,
             p.POSITION_CONTROL,
@@ -109,13 +108,12 @@ class Robot:
             forces=[FORCE] * 6,
             positionGains=[0.5] * 6,
             velocityGains=[1.0] * 6,
-            physicsClientId=self.world.client,
         )
         self._angles = angles
 
     def _touching(self, body: int, link: int) -> list[int]:
         """Bodies that a link touches."""
-        points = p.getContactPoints(bodyA=body, linkIndexA=link, physicsClientId=self.world.client)
+        points = self.world.bullet.getContactPoints(bodyA=body, linkIndexA=link)
         return [point[2] for point in points if point[8] < CONTACT]
 
     def _feels_contact(self) -> bool:
@@ -133,30 +131,20 @@ class Robot:
 
     def _seal(self, index: int) -> None:
         """Fix the block to the cup as it stands."""
-        client, body = self.world.client, self.world.objects[index]
-        link = p.getLinkState(self.world.arm, TIP_LINK, physicsClientId=client)
-        inverse = p.invertTransform(link[4], link[5])
-        place = p.multiplyTransforms(*inverse, *self.world.pose(index))
-        self._grip = p.createConstraint(
-            self.world.arm,
-            TIP_LINK,
-            body,
-            -1,
-            p.JOINT_FIXED,
-            [0, 0, 0],
-            place[0],
-            [0, 0, 0],
-            place[1],
-            physicsClientId=client,
+        world, body = self.world, self.world.objects[index]
+        link = world.bullet.getLinkState(world.arm, TIP_LINK)
+        place, turn = p.multiplyTransforms(*p.invertTransform(link[4], link[5]), *world.pose(index))
+        self._grip = world.bullet.createConstraint(
+            world.arm, TIP_LINK, body, -1, p.JOINT_FIXED, [0, 0, 0], place, [0, 0, 0], turn
         )
         # Cup and block would fight: the constraint holds them where the contact pushes them apart.
-        p.setCollisionFilterPair(self.world.arm, body, TIP_LINK, -1, 0, physicsClientId=client)
+        world.bullet.setCollisionFilterPair(world.arm, body, TIP_LINK, -1, 0)
         self.holding = index
 
     def _release(self) -> None:
         if self.holding < 0:
             return
-        client, body = self.world.client, self.world.objects[self.holding]
-        p.removeConstraint(self._grip, physicsClientId=client)
-        p.setCollisionFilterPair(self.world.arm, body, TIP_LINK, -1, 1, physicsClientId=client)
+        world, body = self.world, self.world.objects[self.holding]
+        world.bullet.removeConstraint(self._grip)
+        world.bullet.setCollisionFilterPair(world.arm, body, TIP_LINK, -1, 1)
         self.holding = -1

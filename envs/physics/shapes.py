@@ -14,9 +14,7 @@ from pathlib import Path
 from envs.geometry import Sizes
 
 SEGMENTS = 24  # corners of the bowl's circle as seen
-
 ARC = 5  # bands of a round wall
-
 STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
 
 WALL_PARTS = 12

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import pybullet as p
@@ -39,6 +41,16 @@ class Image:
     """(H, W), metres along the optical axis; the camera's far distance where nothing is."""
 
 
+@dataclass
+class Bullet:
+    """PyBullet's functions, bound to one of its clients."""
+
+    client: int
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return partial(getattr(p, name), physicsClientId=self.client)
+
+
 class Tabletop:
     """One PyBullet client with a table, the arm and the objects of a scene.
 
@@ -50,7 +62,7 @@ class Tabletop:
         self.image_size = image_size
         self.physics_hz = physics_hz
         self._use(setup)
-        self.client = _connect(gui)
+        self.bullet = _connect(gui)
         self.arm = -1
         self.objects: list[int] = []
         self.blocks: set[int] = set()
@@ -58,9 +70,9 @@ class Tabletop:
 
     def close(self) -> None:
         """Disconnect. Safe to call twice."""
-        if self.client >= 0 and p.isConnected(self.client):
-            p.disconnect(self.client)
-        self.client = -1
+        if self.bullet.isConnected():
+            self.bullet.disconnect()
+        self.bullet.client = -1  # PyBullet gives numbers away again
 
     @property
     def sizes(self) -> Sizes:
@@ -78,26 +90,23 @@ class Tabletop:
 
     def build(self, setup: Setup, scene: Scene, joints: Joints) -> None:
         """Throw everything away and build ``scene`` with the arm at ``joints`` (radians)."""
-        client = self.client
+        bullet = self.bullet
         self._use(setup)
-        p.resetSimulation(physicsClientId=client)
+        bullet.resetSimulation()
         # resetSimulation keeps some parameters and resets others, so all are set each time.
-        p.setPhysicsEngineParameter(
+        bullet.setPhysicsEngineParameter(
             fixedTimeStep=1 / self.physics_hz,
             numSubSteps=0,
             numSolverIterations=50,
             deterministicOverlappingPairs=1,
-            physicsClientId=client,
         )
-        p.setGravity(0, 0, GRAVITY, physicsClientId=client)
+        bullet.setGravity(0, 0, GRAVITY)
         table = self._add_table()
-        self.arm = p.loadURDF(arm_urdf(setup.arm), useFixedBase=True, physicsClientId=client)
-        for index, rgb in enumerate(setup.arm.paint.links if setup.arm.paint else ()):
-            link = index if index < p.getNumJoints(self.arm, physicsClientId=client) else -1
-            rgba = [value / 255 for value in rgb] + [1.0]
-            p.changeVisualShape(self.arm, link, rgbaColor=rgba, physicsClientId=client)
+        self.arm = bullet.loadURDF(arm_urdf(setup.arm), useFixedBase=True)
+        for link, rgb in (setup.arm.paint.links if setup.arm.paint else {}).items():
+            bullet.changeVisualShape(self.arm, link, rgbaColor=_rgba(rgb))
         for index, angle in enumerate(joints):
-            p.resetJointState(self.arm, index, angle, physicsClientId=client)
+            bullet.resetJointState(self.arm, index, angle)
         self._add_objects(scene)
         self.steps = 0
         self._label = np.zeros(2 + max([table, self.arm, *self.objects]), dtype=np.uint8)
@@ -107,7 +116,7 @@ class Tabletop:
 
     def step(self) -> None:
         """One physics step."""
-        p.stepSimulation(physicsClientId=self.client)
+        self.bullet.stepSimulation()
         self.steps += 1
 
     def settle(self, max_steps: int) -> None:
@@ -120,7 +129,7 @@ class Tabletop:
     def pose(self, index: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Position (3, metres, centre of a block, foot of a bowl) and orientation (quaternion x y z w) of an
         object."""
-        return p.getBasePositionAndOrientation(self.objects[index], physicsClientId=self.client)
+        return self.bullet.getBasePositionAndOrientation(self.objects[index])
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions (n, 3) and orientations (n, 4) of all objects."""
@@ -129,14 +138,14 @@ class Tabletop:
 
     def speed(self, index: int) -> float:
         """Linear speed of an object plus its turning speed times a block's size, in m/s."""
-        linear, angular = p.getBaseVelocity(self.objects[index], physicsClientId=self.client)
+        linear, angular = self.bullet.getBaseVelocity(self.objects[index])
         return max(map(abs, linear)) + self.sizes.block * max(map(abs, angular))
 
     def render(self) -> Image:
         """What the camera sees now."""
         light, many = self.setup.light, self.setup.oversampling
         size = self.image_size * many
-        _, _, rgba, depth, bodies = p.getCameraImage(
+        _, _, rgba, depth, bodies = self.bullet.getCameraImage(
             size,
             size,
             self._view,
@@ -147,7 +156,6 @@ class Tabletop:
             lightSpecularCoeff=light.specular,
             shadow=0,
             renderer=p.ER_TINY_RENDERER,
-            physicsClientId=self.client,
         )
         bodies = np.asarray(bodies).reshape(size, size)
         depth = np.asarray(depth, dtype=np.float32).reshape(size, size)
@@ -166,49 +174,43 @@ class Tabletop:
     def _add_table(self) -> int:
         half = [(TABLE.x[1] - TABLE.x[0]) / 2, (TABLE.y[1] - TABLE.y[0]) / 2, TABLE_THICKNESS / 2]
         center = [sum(TABLE.x) / 2, sum(TABLE.y) / 2, -TABLE_THICKNESS / 2]
-        touch = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
+        touch = self.bullet.createCollisionShape(p.GEOM_BOX, halfExtents=half)
         # Without a visual shape PyBullet would draw the contact shape, so the table's look is a speck that it
         # hides itself in; `_empty_table` paints what is really seen.
-        look = p.createVisualShape(p.GEOM_BOX, halfExtents=[1e-4] * 3, physicsClientId=self.client)
-        return p.createMultiBody(0, touch, look, center, physicsClientId=self.client)
+        look = self.bullet.createVisualShape(p.GEOM_BOX, halfExtents=[1e-4] * 3)
+        return self.bullet.createMultiBody(0, touch, look, center)
 
     def _add_objects(self, scene: Scene) -> None:
-        client, sizes = self.client, self.sizes
-        half = [sizes.block / 2] * 3
-        mesh = bowl_mesh(sizes, self.setup.round_bowls)
+        bullet, sizes = self.bullet, self.sizes
+        looks: dict[str, dict[str, Any]] = {
+            "block": {"halfExtents": [sizes.block / 2] * 3},
+            "bowl": vars(bowl_mesh(sizes, self.setup.round_bowls)),
+        }
         # One contact shape serves all bowls, and one all blocks; only looks differ.
-        bowl_touch = p.createCollisionShape(
-            p.GEOM_MESH, fileName=bowl_contact_file(sizes), physicsClientId=client
-        )
-        block_touch = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        touches = {
+            "bowl": bullet.createCollisionShape(p.GEOM_MESH, fileName=bowl_contact_file(sizes)),
+            "block": bullet.createCollisionShape(p.GEOM_BOX, **looks["block"]),
+        }
         self.objects = []
         for index, item in enumerate(scene.objects):
-            rgba = [value / 255 for value in self.setup.object_rgb(index, item.color)] + [1.0]
-            floor = sizes.bowl_floor if item.inside is not None else 0.0
-            floor += sizes.block if item.on is not None else 0.0
+            rgba = _rgba(self.setup.object_rgb(index, item.color))
+            shape, mass, z = p.GEOM_MESH, BOWL_MASS, 0.0
             if item.kind == "block":
-                look = p.createVisualShape(
-                    p.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client
-                )
-                touch, mass = block_touch, BLOCK_MASS
+                floor = sizes.bowl_floor if item.inside is not None else 0.0
+                floor += sizes.block if item.on is not None else 0.0
                 z = floor + sizes.block / 2 if item.height is None else item.height
-            else:
-                look = p.createVisualShape(
-                    p.GEOM_MESH,
-                    vertices=mesh.vertices,
-                    normals=mesh.normals,
-                    indices=mesh.indices,
-                    rgbaColor=rgba,
-                    physicsClientId=client,
-                )
-                touch, mass, z = bowl_touch, BOWL_MASS, 0.0
+                shape, mass = p.GEOM_BOX, BLOCK_MASS
+            look = bullet.createVisualShape(shape, rgbaColor=rgba, **looks[item.kind])
             turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])
-            body = p.createMultiBody(mass, touch, look, [item.x, item.y, z], turn, physicsClientId=client)
-            p.changeDynamics(body, -1, lateralFriction=1.0, physicsClientId=client)
+            body = bullet.createMultiBody(mass, touches[item.kind], look, [item.x, item.y, z], turn)
+            bullet.changeDynamics(body, -1, lateralFriction=1.0)
             self.objects.append(body)
-        self.blocks = {
-            body for body, item in zip(self.objects, scene.objects, strict=True) if item.kind == "block"
-        }
+        bodies = zip(self.objects, scene.objects, strict=True)
+        self.blocks = {body for body, item in bodies if item.kind == "block"}
+
+
+def _rgba(rgb: RGB) -> list[float]:
+    return [value / 255 for value in rgb] + [1.0]
 
 
 @lru_cache(maxsize=4)
@@ -232,14 +234,13 @@ def _empty_table(camera: Camera, table: Box2, table_rgb: RGB, floor_rgb: RGB) ->
     return Image(rgba.reshape(size, size, 4), nothing, depth.reshape(size, size))
 
 
-def _connect(gui: bool) -> int:
+def _connect(gui: bool) -> Bullet:
     # PyBullet ends the whole process when it finds no display, so look before asking.
     if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         logger.warn("render_mode='human' needs a display and DISPLAY is not set: running without a window")
         gui = False
     client = p.connect(p.GUI if gui else p.DIRECT)
     if client < 0:
-        raise RuntimeError(
-            "PyBullet could not start" + (" its window; use render_mode='rgb_array'" if gui else "")
-        )
-    return client
+        hint = " its window; use render_mode='rgb_array'" if gui else ""
+        raise RuntimeError(f"PyBullet could not start{hint}")
+    return Bullet(client)
