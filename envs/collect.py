@@ -35,11 +35,8 @@ else:
     SizesName = tyro.extras.literal_type_from_choices(SIZES)
     FactorName = tyro.extras.literal_type_from_choices(FACTORS)
 
-COLUMNS = 9
-"""Frames of an episode on a contact sheet."""
-
-PIXELS = 128
-GAP = 4
+COLUMNS = 9  # frames of an episode on a contact sheet
+PIXELS, GAP = 128, 4  # height of a row, and the space between its frames
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
         seed=seed,
         instruction=info["instruction"],
         objects=tuple(
-            {name: item[name] for name in ("id", "label", "kind", "color")} for item in info["objects"]
+            {key: item[key] for key in ("id", "label", "kind", "color")} for item in info["objects"]
         ),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
@@ -114,10 +114,10 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
 
 SIDE = -1  # stands for the image size in the shapes below
 
-# Name -> shape of a frame's value, type, frames in a chunk, compression. Flat colours pack so well that gzip at
-# its fastest reads faster than lzf, at half the size (measured).
+# Flat colours pack so well that gzip at its fastest reads faster than lzf, at half the size (measured).
 _IMAGE = {"compression": "gzip", "compression_opts": 1}
 _POSE = {"compression": "lzf"}
+# Name -> shape of a frame's value, type, frames in a chunk, compression.
 _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "frames": ((SIDE, SIDE, 3), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "segmentation": ((SIDE, SIDE), "u1", FRAMES_PER_CHUNK, _IMAGE),
@@ -126,15 +126,16 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "object_position": ((MAX_OBJECTS, 3), "f4", 256, _POSE),
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
-_INDEX: dict[str, Any] = {
-    "start": "i8",
-    "length": "i8",
-    "seed": "i8",
-    "instruction": h5py.string_dtype(),
-    "objects": h5py.string_dtype(),
-    "questions": h5py.string_dtype(),
-    "factors": h5py.string_dtype(),
-    "success": "?",
+_TEXT = h5py.string_dtype()
+# Name -> type and value of an episode; where it starts is known when it is written.
+_COLUMNS: dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]] = {
+    "length": ("i8", lambda episode: len(episode.arrays["frames"])),
+    "seed": ("i8", lambda episode: episode.seed),
+    "instruction": (_TEXT, lambda episode: episode.instruction),
+    "objects": (_TEXT, lambda episode: json.dumps(episode.objects)),
+    "questions": (_TEXT, lambda episode: json.dumps([each._asdict() for each in episode.questions])),
+    "factors": (_TEXT, lambda episode: json.dumps(episode.factors)),
+    "success": ("?", lambda episode: episode.success),
 }
 
 
@@ -142,11 +143,10 @@ def write_episodes(path: Path, config: EpisodeConfig, episodes: Sequence[Recorde
     """Write a complete file; it appears under its name only when it is whole."""
     with _atomically(path, path.parent) as part, h5py.File(part, "w") as file:
         _create(file, config)
-        arrays = {
-            name: np.concatenate([_padded(name, episode.arrays[name]) for episode in episodes])
-            for name in _ARRAYS
-        }
-        _append(file, arrays, _index(episodes))
+        values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
+        for name, (dtype, value) in _COLUMNS.items():
+            values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
+        _append(file, values)
 
 
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
@@ -163,8 +163,8 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
                 _create(file, config)
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
-                    arrays = {name: source[name][:] for name in _ARRAYS}
-                    _append(file, arrays, {name: source["episode"][name][:] for name in _INDEX})
+                    names = [*_ARRAYS, *(f"episode/{name}" for name in _COLUMNS)]
+                    _append(file, {name: source[name][:] for name in names})
 
 
 @contextmanager
@@ -197,18 +197,14 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
             f"{path} is not an episode file ({error}); move it away or choose another --out"
         ) from error
     if kind != FORMAT:
-        raise ValueError(f"{path} is an HDF5 file but not an episode file; choose another --out")
-    if number != FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has format version {number}, and version {FORMAT_VERSION} cannot be appended to it; "
-            "choose another --out"
-        )
-    if found != _config_json(config):
-        raise ValueError(
-            f"{path} was collected with {found}, which differs from {_config_json(config)}; "
-            "choose another --out"
-        )
-    return count
+        problem = "is an HDF5 file but not an episode file"
+    elif number != FORMAT_VERSION:
+        problem = f"has format version {number}, and version {FORMAT_VERSION} cannot be appended to it"
+    elif found != _config_json(config):
+        problem = f"was collected with {found}, which differs from {_config_json(config)}"
+    else:
+        return count
+    raise ValueError(f"{path} {problem}; choose another --out")
 
 
 def _create(file: h5py.File, config: EpisodeConfig) -> None:
@@ -220,35 +216,26 @@ def _create(file: h5py.File, config: EpisodeConfig) -> None:
         file.create_dataset(
             name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(chunk, *shape), **compression
         )
-    for name, dtype in _INDEX.items():
+    for name, dtype in [("start", "i8"), *((name, dtype) for name, (dtype, _) in _COLUMNS.items())]:
         file.create_dataset(f"episode/{name}", (0,), dtype, maxshape=(None,), chunks=(1024,))
     versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
     ur5 = find_package()
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = FORMAT_VERSION
-    file.attrs["split"] = split.name
-    file.attrs["first_seed"] = split.first_seed
+    file.attrs.update(format=FORMAT, format_version=FORMAT_VERSION)
+    file.attrs.update(split=split.name, first_seed=split.first_seed)
     file.attrs["config"] = _config_json(config)
     file.attrs["versions"] = json.dumps(versions | {PACKAGE: ur5.version if ur5 else None})
     file.attrs["vocabulary"] = json.dumps(TASKS[split.task].vocabulary)
     file.attrs["labels"] = json.dumps(LABELS)
-    file.attrs["camera_intrinsics"] = camera.intrinsics
-    file.attrs["camera_extrinsics"] = camera.extrinsics
+    file.attrs.update(camera_intrinsics=camera.intrinsics, camera_extrinsics=camera.extrinsics)
 
 
-def _append(file: h5py.File, arrays: dict[str, NDArray[Any]], index: dict[str, NDArray[Any]]) -> None:
-    first = file["frames"].shape[0]
-    start = first + np.cumsum(index["length"]) - index["length"]
-    for name, values in arrays.items():
-        _extend(file[name], values)
-    for name, values in {**index, "start": start}.items():
-        _extend(file["episode"][name], values)
-
-
-def _extend(dataset: h5py.Dataset, values: NDArray[Any]) -> None:
-    count = dataset.shape[0]
-    dataset.resize(count + len(values), axis=0)
-    dataset[count:] = values
+def _append(file: h5py.File, values: dict[str, NDArray[Any]]) -> None:
+    lengths = values["episode/length"]
+    start = len(file["frames"]) + np.cumsum(lengths) - lengths
+    for name, rows in {**values, "episode/start": start}.items():
+        count = len(file[name])
+        file[name].resize(count + len(rows), axis=0)
+        file[name][count:] = rows
 
 
 def _padded(name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -258,23 +245,6 @@ def _padded(name: str, values: NDArray[Any]) -> NDArray[Any]:
     full = np.full((len(values), MAX_OBJECTS, values.shape[2]), np.nan, dtype=np.float32)
     full[:, : values.shape[1]] = values
     return full
-
-
-def _index(episodes: Sequence[RecordedEpisode]) -> dict[str, NDArray[Any]]:
-    """The columns of `episode`, but for `start`."""
-
-    def column(value: Callable[[RecordedEpisode], Any], dtype: Any = None) -> NDArray[Any]:
-        return np.array([value(episode) for episode in episodes], dtype)
-
-    return {
-        "length": column(lambda e: len(e.arrays["frames"])),
-        "seed": column(lambda e: e.seed),
-        "instruction": column(lambda e: e.instruction, object),
-        "objects": column(lambda e: json.dumps(e.objects), object),
-        "questions": column(lambda e: json.dumps([q._asdict() for q in e.questions]), object),
-        "factors": column(lambda e: json.dumps(e.factors), object),
-        "success": column(lambda e: e.success),
-    }
 
 
 def _config_json(config: EpisodeConfig) -> str:
@@ -287,25 +257,22 @@ def _config_json(config: EpisodeConfig) -> str:
 def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 
-    Finished pieces of 50 episodes wait in ``out``.parts until they are merged into ``out``, in order; both
-    steps are atomic, so a kill loses no finished piece and doubles none.
+    Finished pieces wait in ``out``.parts until they are merged into ``out``, in order. Both steps are atomic,
+    so a kill loses no finished piece and doubles none.
 
     Raises:
         ValueError: when ``out`` exists and is something else, or was collected with another configuration.
     """
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
-    ranges = [
-        (start, min(start + EPISODES_PER_PIECE, episodes))
-        for start in range(done, episodes, EPISODES_PER_PIECE)
-    ]
+    starts = range(done, episodes, EPISODES_PER_PIECE)
+    ranges = [(start, min(start + EPISODES_PER_PIECE, episodes)) for start in starts]
     pieces = [parts / f"{start:07d}-{stop:07d}.h5" for start, stop in ranges]
     waiting: list[Path] = []
     with tqdm(total=episodes, initial=min(done, episodes), unit="episode", desc=config.split) as progress:
         run = Parallel(n_jobs=workers, return_as="generator", pre_dispatch=2 * workers)
-        jobs = (
-            delayed(_collect_piece)(config, *span, piece) for span, piece in zip(ranges, pieces, strict=True)
-        )
+        spans = zip(ranges, pieces, strict=True)
+        jobs = (delayed(_collect_piece)(config, *span, piece) for span, piece in spans)
         for (start, stop), piece, _ in zip(ranges, pieces, run(jobs), strict=True):
             progress.update(stop - start)
             waiting.append(piece)
