@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+Point = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class Box2:

@@ -64,24 +64,11 @@ class SceneRequest:
         low = self.named.count("bowl") + self.blocks_in_bowls + self.target_in_bowl
         return low, min(MAX_BOWLS, self.n_objects - self.named.count("block") - self.blocks_in_bowls)
 
-    def draw_n_bowls(self, rng: np.random.Generator) -> int:
-        """The number of bowls of one scene."""
-        low, high = self.bowl_range
-        return int(rng.integers(low, high + 1)) if self.n_bowls is None else self.n_bowls
-
 
 def sample_objects(
     rng: np.random.Generator, request: SceneRequest, n_bowls: int, named: Sequence[Thing], sizes: Sizes
 ) -> tuple[ObjectSpec, ...]:
-    """Draw the objects of a scene: the named things and others, no two colours alike, and their places.
-
-    Args:
-        rng: the source of chance.
-        request: what the scene must be like.
-        n_bowls: how many of the objects are bowls.
-        named: the things that the instruction names, of the kinds of ``request.named``.
-        sizes: of the objects.
-    """
+    """Draw the objects of a scene: the ``named`` things, others of other colours, and the places of all."""
     named_colors = [thing.color for thing in named]
     others = rng.permutation([color for color in COLORS if color not in named_colors]).tolist()
     n_blocks = request.n_objects - n_bowls
@@ -125,12 +112,12 @@ def _draw_places(
     # Wide things first: a late bowl would find only gaps that fit a block.
     standing.sort(key=lambda index: -sizes.footprint(kinds[index]))
     for _ in range(MAX_TRIES):
-        places = _try_places(rng, request, kinds, standing, sizes)
-        if places is not None:
+        if (places := _try_places(rng, request, kinds, standing, sizes)) is not None:
             break
     else:
+        count = len(standing)
         raise ValueError(
-            f"{len(standing)} objects of this size do not fit on the table; use fewer, or a smaller scale"
+            f"{count} objects of this size do not fit on the table; use fewer, or a smaller scale"
         )
     for block, bowl in insides.items():
         # Within the millimetres that leave the block flat on the bowl's floor at any yaw.

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 
 from envs.colors import RGB, ROBOT_RGB
+from envs.geometry import Point
 from envs.physics.shapes import generated_file
 from envs.physics.ur5 import ur5_meshes
 
 Joints = tuple[float, float, float, float, float, float]
-Point = tuple[float, float, float]
 
 # Universal Robots' published lengths of the UR5, in metres.
 D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823

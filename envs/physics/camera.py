@@ -8,22 +8,22 @@ from math import cos, radians, sin, tan
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.geometry import Point
+
 
 @dataclass(frozen=True)
 class CameraPreset:
     """A place to look from. Metres and degrees; the image is square, so ``aspect`` squashes it."""
 
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
+    eye: Point
+    target: Point
     fov: float  # vertical field of view
     aspect: float = 1.0  # tangent of half the horizontal field of view over that of the vertical one
     near: float = 0.1
     far: float = 10.0
 
 
-def _looking_at(
-    target: tuple[float, float, float], distance: float, pitch: float, fov: float
-) -> CameraPreset:
+def _looking_at(target: Point, distance: float, pitch: float, fov: float) -> CameraPreset:
     eye = (target[0] + distance * cos(radians(pitch)), target[1], target[2] + distance * sin(radians(pitch)))
     return CameraPreset(eye, target, fov, near=distance - 1.0, far=distance + 1.0)
 
@@ -90,12 +90,13 @@ class Camera:
         """OpenGL's projection matrix, column-major."""
         near, far = self.preset.near, self.preset.far
         scale = 1 / tan(radians(self.preset.fov) / 2)
-        matrix = np.zeros((4, 4))
-        matrix[0, 0], matrix[1, 1] = scale / self.preset.aspect, scale
-        matrix[2, 2], matrix[2, 3], matrix[3, 2] = (
-            (far + near) / (near - far),
-            2 * far * near / (near - far),
-            -1,
+        matrix = np.array(
+            [
+                [scale / self.preset.aspect, 0, 0, 0],
+                [0, scale, 0, 0],
+                [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)],
+                [0, 0, -1, 0],
+            ]
         )
         return matrix.T.ravel().tolist()
 

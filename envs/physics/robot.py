@@ -12,7 +12,8 @@ import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 
-from envs.physics.arm import TIP_LINK, Joints, Point
+from envs.geometry import Point
+from envs.physics.arm import TIP_LINK, Joints
 from envs.physics.simulation import Tabletop
 
 CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops

@@ -6,11 +6,13 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from math import dist
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from envs.checks import check_choice
 from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
 from envs.geometry import Sizes
 from envs.physics.robot import Robot
@@ -182,8 +184,12 @@ class Task:
 
     def sample(self, rng: np.random.Generator, request: SceneRequest, sizes: Sizes) -> Scene:
         """Draw a scene: kinds, colours, a goal that is not reached yet, and places."""
-        n_bowls = request.draw_n_bowls(rng)
-        steps = request.instructions or self._draw_instructions(rng, request)
+        low, high = request.bowl_range
+        n_bowls = int(rng.integers(low, high + 1)) if request.n_bowls is None else request.n_bowls
+        steps = request.instructions
+        if not steps:
+            colors = rng.permutation(CAPTION_COLORS[request.color_split])[: len(request.named)].tolist()
+            steps = tuple(map(self.relations[0].between, colors[::2], colors[1::2]))
         objects = sample_objects(rng, request, n_bowls, [t for step in steps for t in step.things], sizes)
         return self.scene(objects, self.find_goal(objects, steps))
 
@@ -212,9 +218,8 @@ class Task:
         pairs = self.open_pairs(objects, color_split)
         while pairs and len(goal) < n_pairs:
             goal.append(pairs[int(rng.integers(len(pairs)))])
-            pairs = [
-                pair for pair in pairs if pair.thing != goal[-1].thing and pair.target != goal[-1].target
-            ]
+            _, thing, target = goal[-1]
+            pairs = [pair for pair in pairs if pair.thing != thing and pair.target != target]
         return tuple(goal)
 
     def questions(self, objects: Sequence[ObjectSpec]) -> tuple[Question, ...]:
@@ -227,15 +232,12 @@ class Task:
     def _pairs(self, objects: Sequence[ObjectSpec]) -> list[GoalPair]:
         """All pairs of objects of the right kinds that have a name of their own and nothing on top."""
         things, covered = [item.thing for item in objects], {item.on for item in objects}
-        ids = [
-            index for index, thing in enumerate(things) if things.count(thing) == 1 and index not in covered
-        ]
+        ids = [i for i, thing in enumerate(things) if things.count(thing) == 1 and i not in covered]
         return [
             GoalPair(relation.name, thing, target)
             for relation in self.relations
-            for thing in ids
-            for target in ids
-            if thing != target and (objects[thing].kind, objects[target].kind) == relation.kinds
+            for thing, target in permutations(ids, 2)
+            if (objects[thing].kind, objects[target].kind) == relation.kinds
         ]
 
     def _parse_step(self, part: str) -> Instruction | None:
@@ -244,12 +246,7 @@ class Task:
                 return relation.between(*match.groups())
         return None
 
-    def _draw_instructions(self, rng: np.random.Generator, request: SceneRequest) -> tuple[Instruction, ...]:
-        colors = rng.permutation(CAPTION_COLORS[request.color_split])[: len(request.named)].tolist()
-        return tuple(map(self.relations[0].between, colors[::2], colors[1::2]))
-
 
 def _check_colors(step: Instruction) -> None:
     for thing in step.things:
-        if thing.color not in COLORS:
-            raise ValueError(f"unknown colour {thing.color!r}; allowed: {', '.join(COLORS)}")
+        check_choice("colour", thing.color, COLORS, form=str)

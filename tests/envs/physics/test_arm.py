@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.colors import COLORS, RGB, ROBOT_RGB
+from envs.geometry import Point
 from envs.physics import ur5
-from envs.physics.arm import TIP_LINK, Arm, Point, arm_urdf
+from envs.physics.arm import TIP_LINK, Arm, arm_urdf
 from envs.scenes import CLIPORT, SIMPLE
 from envs.tabletop import TabletopEnv
 
