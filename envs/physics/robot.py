@@ -5,7 +5,6 @@ Both control modes of the environments run over this one controller, one camera 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import pi
 
 import numpy as np
@@ -16,35 +15,24 @@ from envs.geometry import Point
 from envs.physics.arm import TIP_LINK, Joints
 from envs.physics.simulation import Tabletop
 
+JOINTS = list(range(6))
 CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops
 FORCE = 400.0  # motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject
-
-
-@dataclass(frozen=True)
-class GripperState:
-    """What the gripper is doing."""
-
-    position: Point  # the tip, in metres
-    yaw: float  # radians
-    holding: int  # id of the held object, or -1
 
 
 class Robot:
     """The arm controller on a built `Tabletop`."""
 
     def __init__(self, world: Tabletop, frame_steps: int) -> None:
-        self.world = world
-        self.frame_steps = frame_steps
-        self._joints = list(range(6))
+        self.world, self.frame_steps = world, frame_steps
         self.reset(world.setup.arm.home_joints)
 
     def reset(self, joints: Joints, holding: int = -1) -> None:
         """Take over an arm that was just built at ``joints`` (tool upright), ``holding`` a block or nothing."""
         self.arm = self.world.setup.arm
         self.target, self.yaw = self.arm.forward(joints)
-        self.holding = -1
+        self.holding = self._grip = -1
         self.touched = False
-        self._grip = -1
         self._angles = np.array(joints)
         if holding >= 0:
             self._seal(holding)
@@ -82,19 +70,17 @@ class Robot:
             if lowering and not self.touched and self._feels_contact():
                 # The tip lags a little behind its command: stop where it is, not where it was going to be.
                 self.touched = True
-                start[2] = end[2] = min(start[2], self.state().position[2])
+                start[2] = end[2] = min(start[2], self.tip()[2])
         # Full turns do not matter, and yaw must not grow without bound over a long episode.
         self.yaw = (self.yaw + pi) % (2 * pi) - pi
 
-    def state(self) -> GripperState:
-        """Where the tip really is, and what it holds."""
-        position = self.world.bullet.getLinkState(self.world.arm, TIP_LINK)[4]
-        return GripperState(position, self.yaw, self.holding)
+    def tip(self) -> Point:
+        """Where the tip really is, in metres."""
+        return self.world.bullet.getLinkState(self.world.arm, TIP_LINK)[4]
 
     def joints(self) -> NDArray[np.float64]:
         """Joint angles (6,) in radians."""
-        states = self.world.bullet.getJointStates(self.world.arm, self._joints)
-        return np.array([state[0] for state in states])
+        return np.array([state[0] for state in self.world.bullet.getJointStates(self.world.arm, JOINTS)])
 
     def _drive(self, angles: NDArray[np.float64]) -> None:
         # Wrist3 may take the short way round only at ±pi, which a change of 2 pi would spoil.
@@ -102,7 +88,7 @@ class Robot:
         angles = self._angles + change
         self.world.bullet.setJointMotorControlArray(
             self.world.arm,
-            self._joints,
+            JOINTS,
             p.POSITION_CONTROL,
             targetPositions=angles.tolist(),
             targetVelocities=(change * self.world.physics_hz).tolist(),
@@ -118,17 +104,16 @@ class Robot:
         return [point[2] for point in points if point[8] < CONTACT]
 
     def _feels_contact(self) -> bool:
-        if self.holding >= 0:
-            held = self.world.objects[self.holding]
-            return any(body != self.world.arm for body in self._touching(held, -1))
-        return bool(self._touching(self.world.arm, TIP_LINK))
+        if self.holding < 0:
+            return bool(self._touching(self.world.arm, TIP_LINK))
+        held = self.world.objects[self.holding]
+        return any(body != self.world.arm for body in self._touching(held, -1))
 
     def _try_grip(self) -> None:
-        for body in self._touching(self.world.arm, TIP_LINK):
-            # A bowl has no flat top to seal on.
-            if body in self.world.blocks:
-                self._seal(self.world.objects.index(body))
-                return
+        # A bowl has no flat top to seal on.
+        blocks = [body for body in self._touching(self.world.arm, TIP_LINK) if body in self.world.blocks]
+        if blocks:
+            self._seal(self.world.objects.index(blocks[0]))
 
     def _seal(self, index: int) -> None:
         """Fix the block to the cup as it stands."""
