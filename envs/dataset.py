@@ -35,8 +35,7 @@ FORMAT_VERSION = 2
 EPISODES_PER_PIECE = 50  # a kill costs each worker at most the piece it is at: a few seconds
 EPISODES_PER_MERGE = 500
 
-FRAMES_PER_CHUNK = 4
-"""A random clip of 6 frames touches two or three chunks; larger chunks unpack more that is thrown away."""
+FRAMES_PER_CHUNK = 4  # a clip of 6 frames touches two or three; larger ones unpack more that is thrown away
 
 
 # -- One episode -------------------------------------------------------------------------------------------
@@ -77,8 +76,10 @@ class RecordedEpisode:
     questions: tuple[Question, ...]
     success: bool
     factors: dict[str, Any]  # values of this scene's factors
-    arrays: dict[str, NDArray[Any]]
-    """The arrays over frames (T, ...), named as in the file, without padding for objects."""
+    arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
+
+
+_NAMES = ("id", "label", "kind", "color")  # what the file says of an object
 
 
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
@@ -89,16 +90,12 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
     split = SPLITS[config.split]
     seed = split.seed(episode)
     _, info = env.reset(seed=seed, options=split.options(seed))
-    infos = [info]
-    for action in Expert(env).actions():
-        infos.append(env.step(action)[4])
+    infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
     states = [each["frame_states"] for each in infos]
     return RecordedEpisode(
         seed=seed,
         instruction=info["instruction"],
-        objects=tuple(
-            {key: item[key] for key in ("id", "label", "kind", "color")} for item in info["objects"]
-        ),
+        objects=tuple({key: item[key] for key in _NAMES} for item in info["objects"]),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
         factors=info["factors"],
@@ -150,11 +147,7 @@ def write_episodes(path: Path, config: EpisodeConfig, episodes: Sequence[Recorde
 
 
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
-    """Append the files ``pieces`` to ``path`` (created if missing).
-
-    The longer file is made in the folder ``workshop`` (on the same disk) and then takes the name, so ``path``
-    opens at any moment, also after the process is killed.
-    """
+    """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment, also after a kill."""
     with _atomically(path, workshop) as part:
         if path.exists():
             shutil.copyfile(path, part)
@@ -242,9 +235,7 @@ def _padded(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Values of objects (T, n, d) become (T, MAX_OBJECTS, d), with NaN where there is no object."""
     if not name.startswith("object_"):
         return values
-    full = np.full((len(values), MAX_OBJECTS, values.shape[2]), np.nan, dtype=np.float32)
-    full[:, : values.shape[1]] = values
-    return full
+    return np.pad(values, ((0, 0), (0, MAX_OBJECTS - values.shape[1]), (0, 0)), constant_values=np.nan)
 
 
 def _config_json(config: EpisodeConfig) -> str:

@@ -15,16 +15,16 @@ from envs.scene import HELD_HEIGHT, MAX_OBJECTS, Scene, Thing
 
 Range = tuple[float, float]
 
+# Factors that change the objects. What they did is seen in the objects, so it needs no values.
 SHARES = ("same_color", "in_bowl", "on_block", "carried")
-"""Factors that change the objects. What they did is seen in the objects, so it needs no values."""
 
+# Shapes of the factors whose value in a scene is no single number.
 SHAPES: dict[str, tuple[int, ...]] = {
     "tint": (4, 3),
     "object_gain": (MAX_OBJECTS,),
     "object_tint": (MAX_OBJECTS, 3),
     "camera_shift": (2, 3),
 }
-"""Shapes of the factors whose value in a scene is no single number."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ class Factors:
     """
 
     light_tilt: Range | None = (0.0, 50.0)  # degrees between the light and the vertical
-    light_turn: Range | None = (-180.0, 180.0)
-    """Degrees by which the light is turned about the vertical, from +x to +y."""
+    light_turn: Range | None = (-180.0, 180.0)  # degrees about the vertical, from +x to +y
     ambient: Range | None = (0.45, 0.75)  # strength of the light that comes from everywhere
     diffuse: Range | None = (0.2, 0.5)  # strength of the light from one direction, on a surface that faces it
     specular: Range | None = (0.0, 0.1)
@@ -51,17 +50,13 @@ class Factors:
     object_gain: Range | None = (0.8, 1.1)  # factor of each object's colour
     object_tint: Range | None = (-15.0, 15.0)  # added to each channel of each object's colour
     block: Range | None = (0.038, 0.064)  # edge of the blocks, metres
-    bowl: Range | None = (0.11, 0.15)
-    """Diameter of the bowls, metres, to a millimetre; more where a block could not lie in them."""
+    bowl: Range | None = (0.11, 0.15)  # diameter of the bowls, metres; more where a block would not fit
+    # Metres by which the camera and the point that it looks at move; 1 cm is about 2 pixels at 336x336.
     camera_shift: Range | None = (-0.02, 0.02)
-    """Metres by which the camera's place and the point that it looks at move along each axis; 1 cm is about
-    2 pixels at 336x336."""
     camera_zoom: Range | None = (-1.0, 1.0)  # degrees added to the field of view
-    same_color: float = 0.35
-    """Share of the scenes in which several objects may have one colour (no named thing has a double)."""
+    same_color: float = 0.35  # share of the scenes in which things without a name may have one colour
     in_bowl: float = 0.2  # share of the scenes in which another block starts in another bowl, if it can
-    on_block: float = 0.2
-    """Share of the scenes in which a block starts on another, which is not named, if it can."""
+    on_block: float = 0.2  # share of the scenes in which a block starts on one that is not named, if it can
     carried: float = 0.15  # share of the scenes in which the arm holds the first named block at the start
 
     def __post_init__(self) -> None:
@@ -88,14 +83,7 @@ class Factors:
         }
 
     def rearrange(self, rng: np.random.Generator, scene: Scene, sizes: Sizes, space: Box2) -> Scene:
-        """The scene with doubled colours, and blocks in bowls, on blocks and in the hand; ``rng`` stays.
-
-        Args:
-            rng: the source of chance.
-            scene: as drawn for its goal.
-            sizes: of the objects.
-            space: where a carried block may be, metres.
-        """
+        """The scene with doubled colours, and blocks in bowls, on blocks and in the hand (within ``space``)."""
         objects, streams = list(scene.objects), dict(zip(SHARES, rng.spawn(len(SHARES)), strict=True))
         chosen = {name for name, stream in streams.items() if stream.random() < getattr(self, name)}
         named = {index for pair in scene.goal for index in (pair.thing, pair.target)}
@@ -103,10 +91,8 @@ class Factors:
         def free(kind: str) -> list[int]:
             """Objects on the table that nothing lies in or on, those that the goal names at the end."""
             used = {item.inside for item in objects} | {item.on for item in objects}
-            found = [
-                k for k, item in enumerate(objects) if item.kind == kind and item.stands and k not in used
-            ]
-            return sorted(found, key=named.__contains__)
+            alone = (k for k, item in enumerate(objects) if item.stands and k not in used)
+            return sorted((k for k in alone if objects[k].kind == kind), key=named.__contains__)
 
         if "same_color" in chosen:
             pool = streams["same_color"].permutation(list(COLORS))[:3].tolist()
@@ -138,11 +124,7 @@ NO_FACTORS = Factors().without(FACTORS)
 
 
 def read_factors(values: Any) -> dict[str, Any]:
-    """Check the factors of an earlier scene, as in ``info["factors"]``.
-
-    Raises:
-        ValueError: for anything else.
-    """
+    """The factors of an earlier scene, as in ``info["factors"]``; ValueError for anything else."""
     known = [name for name in FACTORS if name not in SHARES]
     if not isinstance(values, Mapping) or not set(values) <= set(known):
         raise ValueError(f"factors are a mapping with some of {', '.join(known)}, not {values!r}")

@@ -35,30 +35,23 @@ CLIPort's workspace is twice as wide. In a 64x64 image of that, a block would be
 that it fills the `close` camera with blocks of at least 7 pixels.
 """
 
+# Where the centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting arm.
 SPAWN = Box2(x=(0.345, 0.705), y=(-0.16, 0.16))
-"""Where the centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting
-arm."""
 
 TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))  # the table top
 
 
-BLOCK_MASS, BOWL_MASS = 0.02, 0.2
-"""In kilograms, at any size."""
+BLOCK_MASS, BOWL_MASS = 0.02, 0.2  # in kilograms, at any size
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the objects in metres.
-
-    By default they are those of the paper's published frames: 6 cm blocks and 14 cm bowls (CLIPort's own are
-    4 cm and 11.4 cm).
-    """
+    """Sizes of the objects in metres; by default those of the paper's published frames."""
 
     block: float = 0.058  # edge of a block
     bowl_radius: float = 0.069  # outer radius at the rim
     bowl_inner_radius: float = 0.064  # inner radius at the rim
-    bowl_floor_radius: float = 0.048
-    """Inner radius at the floor: wider than half a block's diagonal, so that a block can lie flat."""
+    bowl_floor_radius: float = 0.048  # inner radius at the floor: more than half a block's diagonal
     bowl_foot_radius: float = 0.052  # outer radius where the bowl stands on the table
     bowl_height: float = 0.046
     bowl_floor: float = 0.006  # thickness of the floor
@@ -69,8 +62,7 @@ class Sizes:
 
     def resized(self, block: float, bowl: float) -> Sizes:
         """Blocks of edge ``block``, and bowls of diameter ``bowl`` in the same proportions."""
-        scaled = self.scaled(bowl / (2 * self.bowl_radius))
-        return replace(scaled, block=block)
+        return replace(self.scaled(bowl / (2 * self.bowl_radius)), block=block)
 
     def footprint(self, kind: str) -> float:
         """Radius in metres of the smallest upright cylinder around an object."""

@@ -19,8 +19,7 @@ from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, read_layout
 from envs.scenes import Setup
 from envs.tasks.base import Task
 
-CARRIED_MARGIN = 0.1
-"""A block that is carried at the start is this far inside the spawn area, so that the arm reaches it."""
+CARRIED_MARGIN = 0.1  # how far inside the spawn area a carried block starts, so that the arm reaches it
 
 RANDOM_SCENE_OPTIONS = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
 OPTIONS = ("layout", "instruction", "arm_start", "factors", *RANDOM_SCENE_OPTIONS)
@@ -32,8 +31,7 @@ class ResetOptions:
 
     task: Task
     layout: tuple[ObjectSpec, ...] | None
-    goal: tuple[GoalPair, ...] | None
-    """What the instruction asks for, where layout and instruction are both given."""
+    goal: tuple[GoalPair, ...] | None  # where layout and instruction are both given
     arm_start: str | Joints
     request: SceneRequest
     setup: Setup
@@ -72,7 +70,6 @@ def read_options(
 
     Raises:
         ValueError: for an unknown option, a value that is not allowed, or options that contradict each other.
-            The message says what is allowed.
     """
     options = {} if options is None else options
     if not isinstance(options, Mapping):

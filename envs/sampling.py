@@ -13,28 +13,21 @@ from envs.geometry import SPAWN, Box2, Sizes
 from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
-MAX_TRIES = 5000
-"""Whole layouts to try. The fullest allowed scene needs about 100 (at most 516 in 60 seeds), at 0.3 ms each."""
+MAX_TRIES = 5000  # whole layouts, 0.3 ms each; the fullest scene needs about 100 (at most 516 in 60 seeds)
 
 ARM_JITTER = 0.08  # half-width in radians of the random joint offsets of a perturbed start pose
 
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """What a random scene must be like.
+    """What a random scene must be like; ValueError when no scene can be like that."""
 
-    Raises:
-        ValueError: from `__post_init__`, when no scene can be like that.
-    """
-
-    named: tuple[str, ...]
-    """Kinds of the things that the instruction names, in its order: thing, target, thing, target, ..."""
+    named: tuple[str, ...]  # kinds of what the instruction names, in its order: thing, target, thing, ...
     n_objects: int = 6
     n_bowls: int | None = None  # number of bowls; uniform over the possible numbers when None
     color_split: ColorSplit = "seen"  # which colours the instruction may name
     instructions: tuple[Instruction, ...] | None = None  # what the instruction asks for; drawn when None
-    blocks_in_bowls: int = 0
-    """How many blocks that the instruction does not name start in bowls that it does not name."""
+    blocks_in_bowls: int = 0  # how many blocks that are not named start in bowls that are not named
     target_in_bowl: bool = False  # whether the first named block starts in a bowl that is not named
     spawn: Box2 = SPAWN  # where objects stand
     edge: float = 0.0  # how far from the edge of that area their centres are, in footprints

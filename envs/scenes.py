@@ -34,11 +34,12 @@ class Motion:
 
     pick_height: float  # height of the tip over the place to pick, before and after, in metres
     place_height: float
-    descent_speed: float
-    """In m/s. Contact must fall well inside a frame, for blocks on the table and in bowls."""
+    descent_speed: (
+        float  # in m/s; contact must fall well inside a frame, for blocks on the table and in bowls
+    )
+    # Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down until
+    # something is touched. None: the tip moves softly along straight lines, for fixed times.
     joint_speed: float | None = None
-    """Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down
-    until something is touched. None: the tip moves softly along straight lines, for fixed times."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,11 @@ class Setup:
     sizes: Sizes = SIZES["paper"]
     table_rgb: RGB = TABLE_RGB
     floor_rgb: RGB = FLOOR_RGB
+    # By id, the factor of an object's colour and what is added to it.
     object_tones: tuple[tuple[float, Point], ...] = ((1.0, (0, 0, 0)),) * MAX_OBJECTS
-    """By id, the factor of an object's colour and what is added to it."""
-    round_bowls: bool = False
-    """Whether bowls look round inside and outside instead of conical. They feel the same."""
+    round_bowls: bool = False  # whether bowls look round instead of conical; they feel the same
     oversampling: int = 1  # frames are drawn this many times larger along each axis and averaged
-    crowded: bool = False
-    """Whether objects may share a colour, stand on each other, and hang at the arm at the start."""
+    crowded: bool = False  # whether objects may share a colour, stand on each other, and hang at the arm
     factors: Factors = NO_FACTORS
 
     @property
@@ -83,7 +82,7 @@ class Setup:
         def gray(name: str, usual: RGB, row: int) -> RGB:
             return _shifted((drawn[name],) * 3 if name in drawn else usual, tint[row])
 
-        light, arm, camera, sizes = self.light, self.arm, self.camera, self.sizes
+        light, arm, sizes = self.light, self.arm, self.sizes
         if "light_tilt" in drawn or "light_turn" in drawn:
             x, y, z = light.direction
             tilt = radians(drawn.get("light_tilt", degrees(atan2(hypot(x, y), z))))
@@ -96,19 +95,19 @@ class Setup:
             arm = replace(arm, paint=replace(arm.paint, dark=dark, light=pale))
         if "block" in drawn or "bowl" in drawn:
             block = drawn.get("block", sizes.block)
-            # A block must lie flat on the bowl's floor at any yaw, with a little room. Whole millimetres,
-            # because each bowl is a generated file.
+            # A block must lie flat at any yaw. Whole millimetres, because each bowl is a generated file.
             narrowest = 2 * sizes.bowl_radius * (1.1 * block * 0.5**0.5 / sizes.bowl_floor_radius)
             bowl = max(drawn.get("bowl", 2 * sizes.bowl_radius), narrowest)
             sizes = sizes.resized(block, ceil(1000 * bowl) / 1000)
-        if "camera_shift" in drawn:
-            eye, target = np.array([camera.eye, camera.target]) + drawn["camera_shift"]
-            camera = replace(camera, eye=tuple(eye.tolist()), target=tuple(target.tolist()))
+        view = np.array([self.camera.eye, self.camera.target]) + drawn.get("camera_shift", 0.0)
+        eye, target = map(tuple, view.tolist())
         gains = drawn.get("object_gain", [1.0] * MAX_OBJECTS)
         tints = drawn.get("object_tint", [(0, 0, 0)] * MAX_OBJECTS)
         return replace(
             self,
-            camera=replace(camera, fov=camera.fov + drawn.get("camera_zoom", 0.0)),
+            camera=replace(
+                self.camera, eye=eye, target=target, fov=self.camera.fov + drawn.get("camera_zoom", 0.0)
+            ),
             arm=arm,
             light=light,
             sizes=sizes,

@@ -37,11 +37,7 @@ def ee_space(frame_time: float) -> spaces.Box:
 
 
 def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
-    """The action as float32.
-
-    Raises:
-        ValueError: when it is not a finite element of ``space``.
-    """
+    """The action as float32; ValueError when it is not a finite element of ``space``."""
     try:
         values = np.asarray(action, dtype=np.float32)
     except (TypeError, ValueError):
@@ -57,14 +53,7 @@ def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
 
 
 def observation_space(size: int, far: float, longest: int, extras: tuple[str, ...]) -> spaces.Dict:
-    """The space of observations.
-
-    Args:
-        size: height and width of the images.
-        far: the largest depth, metres.
-        longest: characters of the longest instruction.
-        extras: which of `EXTRAS` there are.
-    """
+    """Images of ``size`` with depths up to ``far`` metres, and sentences of up to ``longest`` characters."""
     parts: dict[str, spaces.Space[Any]] = {
         "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
         "instruction": spaces.Text(longest, min_length=1, charset=CHARSET),

@@ -34,11 +34,7 @@ class Split:
         return self.number * SEEDS_PER_SPLIT
 
     def seed(self, episode: int) -> int:
-        """The seed of an episode.
-
-        Raises:
-            ValueError: when the split has no such episode.
-        """
+        """The seed of an episode; ValueError when the split has no such episode."""
         if not 0 <= episode < SEEDS_PER_SPLIT:
             raise ValueError(f"a split has episodes 0 to {SEEDS_PER_SPLIT - 1}, not {episode}")
         return self.first_seed + episode

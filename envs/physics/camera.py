@@ -39,24 +39,18 @@ PRESETS: dict[str, CameraPreset] = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A preset at an image size.
-
-    Pixels: u to the right, v down, and the centre of the top-left pixel is (u, v) = (0.5, 0.5).
-    """
+    """A preset at an image size. Pixels: u right, v down; the top-left pixel's centre is (0.5, 0.5)."""
 
     preset: CameraPreset
     size: int
-    oversampling: int = 1
-    """Pixels are averages of this many drawn pixels along each axis; masks show the one at the centre."""
+    oversampling: int = 1  # pixels average this many drawn ones along each axis; masks show the central one
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy.
-
-        PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured:
-        masks sit half a pixel right and up of the projected bodies, at any image size), hence the shift of
-        cx and cy. Of an even number of drawn pixels one has that corner at the centre of their average.
-        """
+        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy."""
+        # PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured: masks
+        # sit half a pixel right and up of the projected bodies, at any image size), hence the shift. Of an even
+        # number of drawn pixels one has that corner at the centre of their average.
         half, shift = self.size / 2, (self.oversampling % 2) / (2 * self.oversampling)
         fy = half / tan(radians(self.preset.fov) / 2)
         return np.array([[fy / self.preset.aspect, 0, half + shift], [0, fy, half - shift], [0, 0, 1]])

@@ -12,18 +12,17 @@ from math import dist
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.geometry import Point
 from envs.physics.robot import Robot
 
 Action = NDArray[np.float32]  # (5,): dx, dy, dz in metres, dyaw in radians, suction (on above 0.5)
 
-CLEARANCE = 0.018
-"""How much higher than at the pick the tip lets go, in metres: over the bowl's floor, below its rim."""
+CLEARANCE = 0.018  # metres that the tip lets go higher than at the pick: over the bowl's floor, below its rim
 
 MAX_SPEED = 3.0  # fastest motion of the tip along an axis, in m/s
 MAX_TURN = 8.0  # fastest turn of the tip, in rad/s
 
-CLEAR = 0.06
-"""With joints at constant speed: how far the tip rises straight up first, in metres, out of a bowl."""
+CLEAR = 0.06  # metres that the tip first rises straight up, out of a bowl, with joints at constant speed
 
 # Seconds. Nearly constant, whatever the distance: an episode of the default camera has about 25 frames.
 APPROACH, LIFT, CARRY, LOWER, RELEASE, RISE, RETURN = 4 / 15, 3 / 15, 5 / 15, 2 / 15, 1 / 15, 2 / 15, 4 / 15
@@ -34,14 +33,9 @@ def pick_and_place(
 ) -> Iterator[Action]:
     """The actions of one pick-and-place; each must be executed on ``robot`` before the next is drawn.
 
-    Args:
-        robot: the arm; its contact and grip decide when the descents end.
-        pick: where to descend first, metres.
-        place: where to let go, metres.
-        turn: yaw of the block from pick to place, radians.
-
-    The motion goes on when nothing was gripped: a wrong pick is a real failure, not an error. What already
-    hangs over the place to pick is only carried on.
+    Places are in metres; ``turn`` is the yaw of the block from pick to place, radians. The motion goes on when
+    nothing was gripped: a wrong pick is a real failure, not an error. What already hangs over the place to pick
+    is only carried on.
     """
     yaw, motion, grip_height = robot.yaw, robot.world.setup.motion, robot.world.sizes.block
     over_pick, over_place = (*pick, motion.pick_height), (*place, motion.place_height)
@@ -60,11 +54,8 @@ def pick_and_place(
     yield from _travel(robot, robot.arm.home, RETURN, suction=False, turn=yaw - robot.yaw)
 
 
-def _travel(
-    robot: Robot, goal: tuple[float, ...], seconds: float, suction: bool, turn: float = 0.0
-) -> Iterator[Action]:
-    """Move to ``goal``, softly within ``seconds``, or with joints at constant speed; longer only where the
-    speed limits ask for it."""
+def _travel(robot: Robot, goal: Point, seconds: float, suction: bool, turn: float = 0.0) -> Iterator[Action]:
+    """Move to ``goal``, softly within ``seconds`` (if the speed limits let it), or with joints at constant speed."""
     speed = robot.world.setup.motion.joint_speed
     way = _soft_way(robot, goal, seconds, turn) if speed is None else _joint_way(robot, goal, speed, turn)
     yaw = 0.0
@@ -76,11 +67,11 @@ def _travel(
         yaw = angle
 
 
+# For each frame the tip's place (3, metres), and how far it has turned (radians).
 Way = list[tuple[NDArray[np.float64], float]]
-"""For each frame the tip's place (3, metres), and how far it has turned (radians)."""
 
 
-def _soft_way(robot: Robot, goal: tuple[float, ...], seconds: float, turn: float) -> Way:
+def _soft_way(robot: Robot, goal: Point, seconds: float, turn: float) -> Way:
     start, way = np.array(robot.target), np.array(goal) - robot.target
     peak = 1.5  # of the smooth profile's speed over its mean
     slowest = max(float(np.abs(way).max()) / MAX_SPEED, abs(turn) / MAX_TURN) * peak
@@ -90,10 +81,10 @@ def _soft_way(robot: Robot, goal: tuple[float, ...], seconds: float, turn: float
     return [(start + share * way, share * turn) for share in shares]
 
 
-def _joint_way(robot: Robot, goal: tuple[float, ...], speed: float, turn: float) -> Way:
+def _joint_way(robot: Robot, goal: Point, speed: float, turn: float) -> Way:
     arm, yaw = robot.arm, robot.yaw
     start = np.array(arm.inverse(robot.target, yaw))
-    way = np.array(arm.inverse(arm.within_reach(goal), yaw + turn)) - start  # type: ignore[arg-type]
+    way = np.array(arm.inverse(arm.within_reach(goal), yaw + turn)) - start
     frames = max(1, int(np.ceil(np.linalg.norm(way) / speed / robot.frame_time)))
     while True:
         shares = np.arange(1, frames + 1) / frames
@@ -105,7 +96,7 @@ def _joint_way(robot: Robot, goal: tuple[float, ...], speed: float, turn: float)
         frames += 1
 
 
-def _rise(robot: Robot, goal: tuple[float, ...], seconds: float, suction: bool) -> Iterator[Action]:
+def _rise(robot: Robot, goal: Point, seconds: float, suction: bool) -> Iterator[Action]:
     """Move up to ``goal``; joints at constant speed bend aside, so first straight up, clear of a bowl."""
     motion, (x, y, z) = robot.world.setup.motion, robot.target
     if motion.joint_speed is not None:

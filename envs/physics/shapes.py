@@ -17,8 +17,7 @@ SEGMENTS = 24  # corners of the bowl's circle as seen
 ARC = 5  # bands of a round wall
 STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
 
-WALL_PARTS = 12
-"""Convex parts of the bowl's wall as felt: one per wall segment. A block's edge never meets their corners."""
+WALL_PARTS = 12  # convex parts of the bowl's wall as felt; a block's edge never meets their corners
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,7 @@ class Mesh:
 
 @lru_cache(maxsize=16)
 def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
-    """The visible bowl, conical or ``rounded``: a lathed profile, smooth around the axis, with an edge between
-    two bands of the profile."""
+    """The visible bowl, conical or ``rounded``: a lathed profile, smooth around, with an edge between bands."""
     profile = _round_profile(sizes) if rounded else _bowl_profile(sizes)
     vertices: list[list[float]] = []
     normals: list[list[float]] = []
@@ -85,12 +83,9 @@ def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
 
 @lru_cache(maxsize=16)
 def bowl_contact_file(sizes: Sizes) -> str:
-    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its
-    wall.
-
-    A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
-    several parts; PyBullet turns each group of an OBJ file into one convex hull.
-    """
+    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its wall."""
+    # A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
+    # several parts; PyBullet turns each group of an OBJ file into one convex hull.
     lines: list[str] = []
     count = 0
 
@@ -123,15 +118,12 @@ def bowl_contact_file(sizes: Sizes) -> str:
 
 
 def generated_file(stem: str, suffix: str, text: str) -> str:
-    """Write ``text`` once into the user's temporary folder and return the path; its name carries the
-    content's hash.
-
-    Written beside and renamed, so that processes that start together never read half a file.
-    """
+    """Path of a file with ``text`` in the user's temporary folder; its name carries the content's hash."""
     folder = Path(tempfile.gettempdir()) / f"textocvp-envs-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
     folder.mkdir(exist_ok=True)
     path = folder / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}{suffix}"
     if not path.exists() or path.read_text() != text:
+        # Renamed when whole, so that processes that start together never read half a file.
         part = path.with_suffix(f".{os.getpid()}.part")
         part.write_text(text)
         part.replace(path)

@@ -25,8 +25,8 @@ from envs.scenes import Setup
 GRAVITY = -9.8
 TABLE_THICKNESS = 0.04
 
+# Labels of a segmentation that every scene has: table and floor, and the robot.
 LABELS = {"background": 0, "robot": 1}
-"""Labels of a segmentation that every scene has: table and floor, and the robot."""
 
 FIRST_OBJECT = 2  # object i has the label FIRST_OBJECT + i
 
@@ -37,8 +37,7 @@ class Image:
 
     rgb: NDArray[np.uint8]  # (H, W, 3), 0..255
     segmentation: NDArray[np.uint8]  # (H, W): 0 table and floor, 1 arm, 2 + i object i
-    depth: NDArray[np.float32]
-    """(H, W), metres along the optical axis; the camera's far distance where nothing is."""
+    depth: NDArray[np.float32]  # (H, W), metres along the optical axis; the camera's `far` where nothing is
 
 
 @dataclass
@@ -59,13 +58,11 @@ class Tabletop:
     """
 
     def __init__(self, setup: Setup, image_size: int, physics_hz: int, gui: bool = False) -> None:
-        self.image_size = image_size
-        self.physics_hz = physics_hz
+        self.image_size, self.physics_hz = image_size, physics_hz
         self._use(setup)
         self.bullet = _connect(gui)
         self.arm = -1
         self.objects: list[int] = []
-        self.blocks: set[int] = set()
         self.steps = 0
 
     def close(self) -> None:
@@ -80,13 +77,11 @@ class Tabletop:
         return self.setup.sizes
 
     def _use(self, setup: Setup) -> None:
-        drawn = self.image_size * setup.oversampling
         self.setup = setup
         self.camera = Camera(setup.camera, self.image_size, setup.oversampling)
         self._view, self._projection = self.camera.view_matrix, self.camera.projection_matrix
-        self._background = _empty_table(
-            Camera(setup.camera, drawn), setup.table, setup.table_rgb, setup.floor_rgb
-        )
+        drawn = Camera(setup.camera, self.image_size * setup.oversampling)
+        self._background = _empty_table(drawn, setup.table, setup.table_rgb, setup.floor_rgb)
 
     def build(self, setup: Setup, scene: Scene, joints: Joints) -> None:
         """Throw everything away and build ``scene`` with the arm at ``joints`` (radians)."""
@@ -127,8 +122,7 @@ class Tabletop:
                 return
 
     def pose(self, index: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Position (3, metres, centre of a block, foot of a bowl) and orientation (quaternion x y z w) of an
-        object."""
+        """An object's position (3, metres; centre of a block, foot of a bowl) and quaternion x y z w."""
         return self.bullet.getBasePositionAndOrientation(self.objects[index])
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -215,10 +209,8 @@ def _rgba(rgb: RGB) -> list[float]:
 
 @lru_cache(maxsize=4)
 def _empty_table(camera: Camera, table: Box2, table_rgb: RGB, floor_rgb: RGB) -> Image:
-    """Table and floor without anything on them, as the camera sees them; its colours have a fourth channel.
-
-    They never change, and drawing a surface that fills the view is most of a frame's cost at 336x336.
-    """
+    """Table and floor without anything on them, as the camera sees them; its colours have a fourth channel."""
+    # Drawing a surface that fills the view is most of a frame's cost at 336x336.
     size = camera.size
     v, u = np.mgrid[:size, :size] + 0.5
     rays = np.linalg.inv(camera.intrinsics) @ np.stack([u.ravel(), v.ravel(), np.ones(size * size)])

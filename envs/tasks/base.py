@@ -20,11 +20,10 @@ from envs.physics.simulation import Tabletop
 from envs.sampling import SceneRequest, sample_objects
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
-CLIPORT_RADIUS = 0.05
-"""CLIPort calls it success when an object is this close to its place in the plane (metres)."""
-
-SETTLED_SPEED = 0.05
-"""In m/s. A resting block of a few grams jitters by up to a fifth of this in PyBullet's contact solver."""
+CLIPORT_RADIUS = (
+    0.05  # CLIPort calls it success when an object is this close to its place in the plane (metres)
+)
+SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver
 
 
 class Question(NamedTuple):
@@ -76,8 +75,7 @@ class Task:
     """
 
     relations: tuple[Relation, ...]
-    pairs: tuple[int, int] = (1, 1)
-    """Fewest and most (thing, target) pairs of a random goal. A given instruction has 1 to the most."""
+    pairs: tuple[int, int] = (1, 1)  # fewest and most of a random goal; a given instruction has 1 to the most
 
     @property
     def grammar(self) -> str:
@@ -99,11 +97,7 @@ class Task:
         return max(len(self.format([r.between(color, color)] * self.pairs[1])) for r in self.relations)
 
     def format(self, instructions: Iterable[Instruction]) -> str:
-        """The sentence that asks for ``instructions``, in their order.
-
-        Raises:
-            ValueError: for no instruction at all, or a colour that does not exist.
-        """
+        """The sentence that asks for ``instructions``; ValueError for none, or a colour that does not exist."""
         steps = list(instructions)
         if not steps:
             raise ValueError("a sentence needs at least one instruction")
@@ -137,15 +131,11 @@ class Task:
         return tuple(steps)
 
     def check_instructions(self, instructions: Sequence[Instruction]) -> None:
-        """Refuse what no scene of the task can be asked for.
-
-        Raises:
-            ValueError: for too many instructions, or a target named twice that has room for one thing.
-        """
-        if len(instructions) > self.pairs[1]:
+        """Raise ValueError for too many instructions, or a target named twice that has room for one thing."""
+        count, most = len(instructions), self.pairs[1]
+        if count > most:
             raise ValueError(
-                f"this environment takes instructions of at most {self.pairs[1]} (thing, target) pairs, "
-                f"not {len(instructions)}"
+                f"this environment takes instructions of at most {most} (thing, target) pairs, not {count}"
             )
         for relation in self.relations:
             targets = [step.target for step in instructions if step.relation == relation.name]
@@ -159,21 +149,13 @@ class Task:
         """The relation that a goal pair or an instruction names."""
         return next(relation for relation in self.relations if relation.name == step.relation)
 
-    def find_goal(
-        self, objects: Sequence[ObjectSpec], instructions: Iterable[Instruction]
-    ) -> tuple[GoalPair, ...]:
-        """The ids of what is named.
-
-        Raises:
-            ValueError: when the scene does not have a named thing, or more than one that is called so.
-        """
+    def find_goal(self, objects: Sequence[ObjectSpec], steps: Sequence[Instruction]) -> tuple[GoalPair, ...]:
+        """The ids of what is named; ValueError when the scene does not have exactly one thing called so."""
         things = [item.thing for item in objects]
         ids = {thing: index for index, thing in enumerate(things)}
-        steps = tuple(instructions)
         for thing in (thing for step in steps for thing in step.things):
             if thing not in ids:
-                there = ", ".join(str(item.thing) for item in objects)
-                raise ValueError(f"the scene has no {thing}; it has: {there}")
+                raise ValueError(f"the scene has no {thing}; it has: {', '.join(map(str, things))}")
             if things.count(thing) > 1:
                 raise ValueError(f"the scene has {things.count(thing)} objects that are a {thing}")
         return tuple(GoalPair(step.relation, ids[step.thing], ids[step.target]) for step in steps)
