@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,23 +20,22 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from envs.expert import Expert
-from envs.physics.camera import PRESETS, Camera
+from envs.factors import Factors
+from envs.physics.camera import Camera
 from envs.physics.simulation import LABELS
+from envs.physics.ur5 import PACKAGE, find_package
 from envs.scene import MAX_OBJECTS
+from envs.scenes import Setup, make_setup
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks import TASKS, Question
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
-
-EPISODES_PER_PIECE = 50
-"""A kill costs each worker at most the piece it is at: a few seconds."""
-
+EPISODES_PER_PIECE = 50  # a kill costs each worker at most the piece it is at: a few seconds
 EPISODES_PER_MERGE = 500
 
-FRAMES_PER_CHUNK = 4
-"""A random clip of 6 frames touches two or three chunks; larger chunks unpack more that is thrown away."""
+FRAMES_PER_CHUNK = 4  # a clip of 6 frames touches two or three; larger ones unpack more that is thrown away
 
 
 # -- One episode -------------------------------------------------------------------------------------------
@@ -47,16 +46,24 @@ class EpisodeConfig:
     """What, beside the seed, decides the content of an episode."""
 
     split: str
+    scene: str = "simple"
     image_size: int = 64
-    camera: str = "close"
+    camera: str | None = None  # None, as for the next two and the factors: the scene's own
+    sizes: str | None = None
+    physics_hz: int | None = None
+    factors: Factors | None = None
     object_scale: float = 1.0
     render_stride: int = 16
-    physics_hz: int = 240
 
     def make(self) -> TabletopEnv:
         """The environment that plays such episodes."""
-        arguments = asdict(self)
+        arguments = {field.name: getattr(self, field.name) for field in fields(self)}
         return TabletopEnv(SPLITS[arguments.pop("split")].task, record_frames=True, **arguments)
+
+    @property
+    def setup(self) -> Setup:
+        """What is alike in all scenes."""
+        return make_setup(self.scene, self.camera, self.sizes, self.factors, self.object_scale)
 
 
 @dataclass(frozen=True)
@@ -65,12 +72,14 @@ class RecordedEpisode:
 
     seed: int
     instruction: str
-    objects: tuple[dict[str, Any], ...]
-    """By id; each with `id`, `label`, `kind` and `color`."""
+    objects: tuple[dict[str, Any], ...]  # by id; each with `id`, `label`, `kind` and `color`
     questions: tuple[Question, ...]
     success: bool
-    arrays: dict[str, NDArray[Any]]
-    """The arrays over frames (T, ...), named as in the file, without padding for objects."""
+    factors: dict[str, Any]  # values of this scene's factors
+    arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
+
+
+_NAMES = ("id", "label", "kind", "color")  # what the file says of an object
 
 
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
@@ -81,18 +90,15 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
     split = SPLITS[config.split]
     seed = split.seed(episode)
     _, info = env.reset(seed=seed, options=split.options(seed))
-    infos = [info]
-    for action in Expert(env).actions():
-        infos.append(env.step(action)[4])
+    infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
     states = [each["frame_states"] for each in infos]
     return RecordedEpisode(
         seed=seed,
         instruction=info["instruction"],
-        objects=tuple(
-            {name: item[name] for name in ("id", "label", "kind", "color")} for item in info["objects"]
-        ),
+        objects=tuple({key: item[key] for key in _NAMES} for item in info["objects"]),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
+        factors=info["factors"],
         arrays={
             "frames": np.concatenate([each["frames"] for each in infos]),
             "segmentation": np.concatenate([each["frame_segmentations"] for each in infos]),
@@ -103,13 +109,12 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
 
 # -- The file ----------------------------------------------------------------------------------------------
 
-SIDE = -1
-"""Stands for the image size in the shapes below."""
+SIDE = -1  # stands for the image size in the shapes below
 
-# Name -> shape of a frame's value, type, frames in a chunk, compression. Flat colours pack so well that gzip at
-# its fastest reads faster than lzf, at half the size (measured).
+# Flat colours pack so well that gzip at its fastest reads faster than lzf, at half the size (measured).
 _IMAGE = {"compression": "gzip", "compression_opts": 1}
 _POSE = {"compression": "lzf"}
+# Name -> shape of a frame's value, type, frames in a chunk, compression.
 _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "frames": ((SIDE, SIDE, 3), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "segmentation": ((SIDE, SIDE), "u1", FRAMES_PER_CHUNK, _IMAGE),
@@ -118,14 +123,16 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "object_position": ((MAX_OBJECTS, 3), "f4", 256, _POSE),
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
-_INDEX: dict[str, Any] = {
-    "start": "i8",
-    "length": "i8",
-    "seed": "i8",
-    "instruction": h5py.string_dtype(),
-    "objects": h5py.string_dtype(),
-    "questions": h5py.string_dtype(),
-    "success": "?",
+_TEXT = h5py.string_dtype()
+# Name -> type and value of an episode; where it starts is known when it is written.
+_COLUMNS: dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]] = {
+    "length": ("i8", lambda episode: len(episode.arrays["frames"])),
+    "seed": ("i8", lambda episode: episode.seed),
+    "instruction": (_TEXT, lambda episode: episode.instruction),
+    "objects": (_TEXT, lambda episode: json.dumps(episode.objects)),
+    "questions": (_TEXT, lambda episode: json.dumps([each._asdict() for each in episode.questions])),
+    "factors": (_TEXT, lambda episode: json.dumps(episode.factors)),
+    "success": ("?", lambda episode: episode.success),
 }
 
 
@@ -133,19 +140,14 @@ def write_episodes(path: Path, config: EpisodeConfig, episodes: Sequence[Recorde
     """Write a complete file; it appears under its name only when it is whole."""
     with _atomically(path, path.parent) as part, h5py.File(part, "w") as file:
         _create(file, config)
-        arrays = {
-            name: np.concatenate([_padded(name, episode.arrays[name]) for episode in episodes])
-            for name in _ARRAYS
-        }
-        _append(file, arrays, _index(episodes))
+        values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
+        for name, (dtype, value) in _COLUMNS.items():
+            values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
+        _append(file, values)
 
 
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
-    """Append the files ``pieces`` to ``path`` (created if missing).
-
-    The longer file is made in the folder ``workshop`` (on the same disk) and then takes the name, so ``path``
-    opens at any moment, also after the process is killed.
-    """
+    """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment, also after a kill."""
     with _atomically(path, workshop) as part:
         if path.exists():
             shutil.copyfile(path, part)
@@ -154,8 +156,8 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
                 _create(file, config)
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
-                    arrays = {name: source[name][:] for name in _ARRAYS}
-                    _append(file, arrays, {name: source["episode"][name][:] for name in _INDEX})
+                    names = [*_ARRAYS, *(f"episode/{name}" for name in _COLUMNS)]
+                    _append(file, {name: source[name][:] for name in names})
 
 
 @contextmanager
@@ -188,85 +190,56 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
             f"{path} is not an episode file ({error}); move it away or choose another --out"
         ) from error
     if kind != FORMAT:
-        raise ValueError(f"{path} is an HDF5 file but not an episode file; choose another --out")
-    if number != FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has format version {number}, and version {FORMAT_VERSION} cannot be appended to it; "
-            "choose another --out"
-        )
-    if found != _config_json(config):
-        raise ValueError(
-            f"{path} was collected with {found}, which differs from {_config_json(config)}; "
-            "choose another --out"
-        )
-    return count
+        problem = "is an HDF5 file but not an episode file"
+    elif number != FORMAT_VERSION:
+        problem = f"has format version {number}, and version {FORMAT_VERSION} cannot be appended to it"
+    elif found != _config_json(config):
+        problem = f"was collected with {found}, which differs from {_config_json(config)}"
+    else:
+        return count
+    raise ValueError(f"{path} {problem}; choose another --out")
 
 
 def _create(file: h5py.File, config: EpisodeConfig) -> None:
     """Make all datasets, empty, and all attributes."""
-    split, camera = SPLITS[config.split], Camera(PRESETS[config.camera], config.image_size)
+    split, setup = SPLITS[config.split], config.setup
+    camera = Camera(setup.camera, config.image_size, setup.oversampling)
     for name, (shape, dtype, chunk, compression) in _ARRAYS.items():
         shape = tuple(config.image_size if n == SIDE else n for n in shape)
         file.create_dataset(
             name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(chunk, *shape), **compression
         )
-    for name, dtype in _INDEX.items():
+    for name, dtype in [("start", "i8"), *((name, dtype) for name, (dtype, _) in _COLUMNS.items())]:
         file.create_dataset(f"episode/{name}", (0,), dtype, maxshape=(None,), chunks=(1024,))
-    packages = ("pybullet", "gymnasium", "numpy", "h5py")
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = FORMAT_VERSION
-    file.attrs["split"] = split.name
-    file.attrs["first_seed"] = split.first_seed
+    versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
+    ur5 = find_package()
+    file.attrs.update(format=FORMAT, format_version=FORMAT_VERSION)
+    file.attrs.update(split=split.name, first_seed=split.first_seed)
     file.attrs["config"] = _config_json(config)
-    file.attrs["versions"] = json.dumps({name: version(name) for name in packages})
+    file.attrs["versions"] = json.dumps(versions | {PACKAGE: ur5.version if ur5 else None})
     file.attrs["vocabulary"] = json.dumps(TASKS[split.task].vocabulary)
     file.attrs["labels"] = json.dumps(LABELS)
-    file.attrs["camera_intrinsics"] = camera.intrinsics
-    file.attrs["camera_extrinsics"] = camera.extrinsics
+    file.attrs.update(camera_intrinsics=camera.intrinsics, camera_extrinsics=camera.extrinsics)
 
 
-def _append(file: h5py.File, arrays: dict[str, NDArray[Any]], index: dict[str, NDArray[Any]]) -> None:
-    first = file["frames"].shape[0]
-    start = first + np.cumsum(index["length"]) - index["length"]
-    for name, values in arrays.items():
-        _extend(file[name], values)
-    for name, values in {**index, "start": start}.items():
-        _extend(file["episode"][name], values)
-
-
-def _extend(dataset: h5py.Dataset, values: NDArray[Any]) -> None:
-    count = dataset.shape[0]
-    dataset.resize(count + len(values), axis=0)
-    dataset[count:] = values
+def _append(file: h5py.File, values: dict[str, NDArray[Any]]) -> None:
+    lengths = values["episode/length"]
+    start = len(file["frames"]) + np.cumsum(lengths) - lengths
+    for name, rows in {**values, "episode/start": start}.items():
+        count = len(file[name])
+        file[name].resize(count + len(rows), axis=0)
+        file[name][count:] = rows
 
 
 def _padded(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Values of objects (T, n, d) become (T, MAX_OBJECTS, d), with NaN where there is no object."""
     if not name.startswith("object_"):
         return values
-    full = np.full((len(values), MAX_OBJECTS, values.shape[2]), np.nan, dtype=np.float32)
-    full[:, : values.shape[1]] = values
-    return full
-
-
-def _index(episodes: Sequence[RecordedEpisode]) -> dict[str, NDArray[Any]]:
-    """The columns of `episode`, but for `start`."""
-
-    def column(value: Callable[[RecordedEpisode], Any], dtype: Any = None) -> NDArray[Any]:
-        return np.array([value(episode) for episode in episodes], dtype)
-
-    return {
-        "length": column(lambda e: len(e.arrays["frames"])),
-        "seed": column(lambda e: e.seed),
-        "instruction": column(lambda e: e.instruction, object),
-        "objects": column(lambda e: json.dumps(e.objects), object),
-        "questions": column(lambda e: json.dumps([q._asdict() for q in e.questions]), object),
-        "success": column(lambda e: e.success),
-    }
+    return np.pad(values, ((0, 0), (0, MAX_OBJECTS - values.shape[1]), (0, 0)), constant_values=np.nan)
 
 
 def _config_json(config: EpisodeConfig) -> str:
-    return json.dumps(asdict(config))
+    return json.dumps(asdict(config) | {"factors": asdict(config.setup.factors)})
 
 
 # -- Many processes, one file ------------------------------------------------------------------------------
@@ -275,25 +248,22 @@ def _config_json(config: EpisodeConfig) -> str:
 def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 
-    Finished pieces of 50 episodes wait in ``out``.parts until they are merged into ``out``, in order; both
-    steps are atomic, so a kill loses no finished piece and doubles none.
+    Finished pieces wait in ``out``.parts until they are merged into ``out``, in order. Both steps are atomic,
+    so a kill loses no finished piece and doubles none.
 
     Raises:
         ValueError: when ``out`` exists and is something else, or was collected with another configuration.
     """
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
-    ranges = [
-        (start, min(start + EPISODES_PER_PIECE, episodes))
-        for start in range(done, episodes, EPISODES_PER_PIECE)
-    ]
+    starts = range(done, episodes, EPISODES_PER_PIECE)
+    ranges = [(start, min(start + EPISODES_PER_PIECE, episodes)) for start in starts]
     pieces = [parts / f"{start:07d}-{stop:07d}.h5" for start, stop in ranges]
     waiting: list[Path] = []
     with tqdm(total=episodes, initial=min(done, episodes), unit="episode", desc=config.split) as progress:
         run = Parallel(n_jobs=workers, return_as="generator", pre_dispatch=2 * workers)
-        jobs = (
-            delayed(_collect_piece)(config, *span, piece) for span, piece in zip(ranges, pieces, strict=True)
-        )
+        spans = zip(ranges, pieces, strict=True)
+        jobs = (delayed(_collect_piece)(config, *span, piece) for span, piece in spans)
         for (start, stop), piece, _ in zip(ranges, pieces, run(jobs), strict=True):
             progress.update(stop - start)
             waiting.append(piece)

@@ -9,17 +9,14 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.geometry import WORKSPACE
 from envs.physics.motion import pick_and_place
 from envs.scene import GoalPair
+from envs.spaces import primitive_space
 from envs.tabletop import TabletopEnv
 
 
 class Expert:
-    """Plays an environment with the simulator's own knowledge.
-
-    Args:
-        env: a `TabletopEnv`, in either control mode, wrapped or not.
+    """Plays a `TabletopEnv`, in either control mode, wrapped or not, with the simulator's own knowledge.
 
     Raises:
         TypeError: for another environment.
@@ -35,9 +32,7 @@ class Expert:
         """The actions that carry out an instruction, in the environment's control mode.
 
         Each is to be executed before the next is drawn: ``for action in expert.actions(): env.step(action)``.
-
-        Args:
-            instruction: any instruction about this scene; by default the scene's own.
+        By default the instruction is the scene's own.
 
         Raises:
             ValueError: at once, when the instruction cannot be read or names a thing that is not there.
@@ -52,9 +47,8 @@ class Expert:
         place = self._env.task.relation(pair).place(world, pair)
         values = np.array([*world.pose(pair.thing)[0][:2], *place], dtype=np.float32)
         # Things can be pushed out of the workspace, where no action may point.
-        low = np.array([WORKSPACE.x[0], WORKSPACE.y[0]] * 2, dtype=np.float32)
-        high = np.array([WORKSPACE.x[1], WORKSPACE.y[1]] * 2, dtype=np.float32)
-        return np.clip(values, low, high)
+        space = primitive_space(world.setup.workspace, place_yaw=False)
+        return np.clip(values, space.low, space.high)
 
     def _play(self, goal: tuple[GoalPair, ...]) -> Iterator[NDArray[np.float32]]:
         env = self._env
@@ -62,7 +56,6 @@ class Expert:
             action = self.primitive(pair)
             if env.control == "primitive":
                 yield np.append(action, np.float32(0)) if env.place_yaw else action
-            else:
-                # Through float32, as a primitive's values pass: both modes then move alike to the last bit.
-                pick_x, pick_y, place_x, place_y = map(float, action)
-                yield from pick_and_place(env.robot, (pick_x, pick_y), (place_x, place_y))
+            else:  # from the float32 values of a primitive: both modes then move alike to the last bit
+                x, y, place_x, place_y = action.tolist()
+                yield from pick_and_place(env.robot, (x, y), (place_x, place_y))

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from envs.checks import check_choice, check_range
 from envs.colors import CAPTION_COLORS
-from envs.geometry import Sizes
-from envs.physics.arm import Joints, forward_kinematics
-from envs.physics.robot import HOME_JOINTS, REACH_HIGH, REACH_LOW
+from envs.factors import read_factors
+from envs.geometry import Point, Sizes
+from envs.physics.arm import Arm, Joints
 from envs.sampling import SceneRequest, arm_jitter
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, read_layout
+from envs.scenes import Setup
 from envs.tasks.base import Task
 
+CARRIED_MARGIN = 0.1  # how far inside the spawn area a carried block starts, so that the arm reaches it
+
 RANDOM_SCENE_OPTIONS = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
-OPTIONS = ("layout", "instruction", "arm_start", *RANDOM_SCENE_OPTIONS)
+OPTIONS = ("layout", "instruction", "arm_start", "factors", *RANDOM_SCENE_OPTIONS)
 
 
 @dataclass(frozen=True)
@@ -26,44 +31,60 @@ class ResetOptions:
 
     task: Task
     layout: tuple[ObjectSpec, ...] | None
-    goal: tuple[GoalPair, ...] | None
-    """What the instruction asks for, where layout and instruction are both given."""
+    goal: tuple[GoalPair, ...] | None  # where layout and instruction are both given
     arm_start: str | Joints
     request: SceneRequest
+    setup: Setup
+    factors: dict[str, Any] | None  # values to use instead of random ones
 
-    def draw(self, rng: np.random.Generator, sizes: Sizes) -> tuple[Scene, Joints]:
-        """The scene to build, and the joint angles the arm starts at."""
-        task, layout, request = self.task, self.layout, self.request
+    def draw(self, rng: np.random.Generator) -> tuple[Setup, dict[str, Any], Scene, Joints]:
+        """What to build: the setup, the values of its factors, the scene, and the arm's joint angles."""
+        task, layout, request, factors = self.task, self.layout, self.request, self.setup.factors
+        drawn = factors.draw(rng) if self.factors is None else self.factors
+        if layout is not None and self.factors is None:  # the layout was checked with the usual sizes
+            drawn = {name: value for name, value in drawn.items() if name not in ("block", "bowl")}
+        setup = self.setup.with_factors(drawn)
         if layout is None:
-            scene = task.sample(rng, request, sizes)
+            scene = task.sample(rng, request, setup.sizes)
+            scene = factors.rearrange(rng, scene, setup.sizes, setup.spawn.shrunk(CARRIED_MARGIN))
         else:
-            scene = task.scene(
-                layout, self.goal or task.draw_goal(rng, layout, request.color_split, request.n_pairs)
-            )
-        start = HOME_JOINTS if isinstance(self.arm_start, str) else self.arm_start
-        offsets = arm_jitter(rng) if self.arm_start == "random" else (0.0,) * 6
-        joints = tuple(angle + offset for angle, offset in zip(start, offsets, strict=True))
-        return scene, joints  # type: ignore[return-value]
+            goal = self.goal or task.draw_goal(rng, layout, request.color_split, request.n_pairs)
+            scene = task.scene(layout, goal)
+        joints = setup.arm.home_joints if isinstance(self.arm_start, str) else self.arm_start
+        if self.arm_start == "random":
+            joints = tuple(np.add(joints, arm_jitter(rng)).tolist())
+        if scene.held >= 0:
+            joints = setup.arm.inverse(_holding_tip(scene.objects[scene.held], setup.sizes), 0.0)
+        return setup, drawn, scene, joints
+
+
+def _holding_tip(item: ObjectSpec, sizes: Sizes) -> Point:
+    """Where the tip holds a block."""
+    return item.x, item.y, (item.height or 0.0) + sizes.block / 2
 
 
 def read_options(
-    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, sizes: Sizes
+    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, setup: Setup
 ) -> ResetOptions:
     """Check `options`; what is not given comes from ``defaults``.
 
     Raises:
         ValueError: for an unknown option, a value that is not allowed, or options that contradict each other.
-            The message says what is allowed.
     """
     options = {} if options is None else options
     if not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping, not {type(options).__name__}")
-    unknown = sorted(set(options) - set(OPTIONS))
-    if unknown:
-        raise ValueError(
-            f"unknown reset option {', '.join(map(repr, unknown))}; allowed: {', '.join(OPTIONS)}"
-        )
-    layout = read_layout(options["layout"], sizes) if options.get("layout") is not None else None
+    if unknown := ", ".join(map(repr, sorted(set(options) - set(OPTIONS)))):
+        raise ValueError(f"unknown reset option {unknown}; allowed: {', '.join(OPTIONS)}")
+    factors = read_factors(options["factors"]) if options.get("factors") is not None else None
+    layout = None
+    if options.get("layout") is not None:
+        sizes = setup.with_factors(factors or {}).sizes
+        layout = read_layout(options["layout"], sizes, setup.workspace, setup.crowded)
+        for item in layout:
+            tip = _holding_tip(item, sizes)
+            if item.height is not None and setup.arm.within_reach(tip) != tip:
+                raise ValueError(f"the arm cannot hold the {item.thing} at {tip[:2]}, {item.height} m high")
     steps = task.parse(options["instruction"]) if options.get("instruction") is not None else None
     if layout is not None:
         clash = [name for name in RANDOM_SCENE_OPTIONS if name in options and name != "color_split"]
@@ -85,7 +106,8 @@ def read_options(
             f"has anything to do in this layout; give an 'instruction', or another 'color_split'"
         )
     task.check_instructions(steps or ())
-    return ResetOptions(task, layout, goal, _read_arm_start(options.get("arm_start", "home")), request)
+    arm_start = _read_arm_start(options.get("arm_start", "home"), setup.arm)
+    return ResetOptions(task, layout, goal, arm_start, request, setup, factors)
 
 
 def _read_request(
@@ -94,49 +116,35 @@ def _read_request(
     steps: tuple[Instruction, ...] | None,
     has_layout: bool,
 ) -> SceneRequest:
-    split = options.get("color_split", defaults.color_split)
-    if split not in CAPTION_COLORS:
-        raise ValueError(f"unknown color_split {split!r}; allowed: {', '.join(CAPTION_COLORS)}")
-    given: dict[str, Any] = {"color_split": split}
+    given = {name: options[name] for name in RANDOM_SCENE_OPTIONS if name in options}
+    check_choice("color_split", given.get("color_split", "all"), CAPTION_COLORS, form=str)
     for name in ("n_objects", "n_bowls", "blocks_in_bowls"):
-        value = options.get(name, getattr(defaults, name))
-        if name in options and (
-            isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0
-        ):
-            raise ValueError(f"{name} must be a whole number of at least 0, not {value!r}")
-        given[name] = value
-    given["target_in_bowl"] = options.get("target_in_bowl", defaults.target_in_bowl)
-    if not isinstance(given["target_in_bowl"], bool | np.bool_):
+        check_range(name, given.get(name, 0), 0, None, whole=True)
+    if not isinstance(given.get("target_in_bowl", False), bool | np.bool_):
         raise ValueError(f"target_in_bowl must be True or False, not {given['target_in_bowl']!r}")
     if steps is not None and not has_layout:
         named = [thing for step in steps for thing in step.things]
         if len({thing.color for thing in named}) < len(named):
             raise ValueError(
-                "no two objects of a random scene share a colour, so its instruction must not "
-                "name a colour twice"
+                "no two objects of a random scene share a colour, so its instruction must not name a colour twice"
             )
         given |= {"instructions": steps, "named": tuple(thing.kind for thing in named)}
     return replace(defaults, **given)
 
 
-def _read_arm_start(value: Any) -> str | Joints:
-    if isinstance(value, str):
-        if value in ("home", "random"):
-            return value
-    else:
-        try:
-            angles = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            angles = np.empty(0)
+def _read_arm_start(value: Any, arm: Arm) -> str | Joints:
+    if isinstance(value, str) and value in ("home", "random"):
+        return value
+    with suppress(TypeError, ValueError):
+        angles = np.asarray(value, dtype=float)
         if angles.shape == (6,) and np.isfinite(angles).all():
             joints: Joints = tuple(angles.tolist())
-            tip, _ = forward_kinematics(joints)
+            tip, _ = arm.forward(joints)
             upright = abs(sum(joints[1:4])) < 1e-3 and abs(joints[4]) < 1e-3
-            within = all(low <= at <= high for low, at, high in zip(REACH_LOW, tip, REACH_HIGH, strict=True))
-            if upright and within:
+            if upright and max(map(abs, np.subtract(arm.within_reach(tip), tip))) < 1e-9:
                 return joints
     raise ValueError(
         f"arm_start must be 'home', 'random' or 6 finite joint angles in radians with the tool upright "
-        f"(lift + elbow + wrist1 = 0, wrist2 = 0) and its tip between {REACH_LOW} and {REACH_HIGH} m; "
+        f"(lift + elbow + wrist1 = 0, wrist2 = 0) and its tip between {arm.reach_low} and {arm.reach_high} m; "
         f"got {value!r}"
     )

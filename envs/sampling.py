@@ -9,38 +9,28 @@ from math import hypot, pi
 import numpy as np
 
 from envs.colors import COLORS, ColorSplit
-from envs.geometry import SPAWN, Sizes
+from envs.geometry import SPAWN, Box2, Sizes
 from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
-MAX_TRIES = 5000
-"""Whole layouts to try. The fullest allowed scene needs about 100 (at most 516 in 60 seeds), at 0.3 ms each."""
+MAX_TRIES = 5000  # whole layouts, 0.3 ms each; the fullest scene needs about 100 (at most 516 in 60 seeds)
 
-ARM_JITTER = 0.08
-"""Half-width in radians of the random joint offsets of a perturbed start pose."""
+ARM_JITTER = 0.08  # half-width in radians of the random joint offsets of a perturbed start pose
 
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """What a random scene must be like.
+    """What a random scene must be like; ValueError when no scene can be like that."""
 
-    Raises:
-        ValueError: from `__post_init__`, when no scene can be like that.
-    """
-
-    named: tuple[str, ...]
-    """Kinds of the things that the instruction names, in its order: thing, target, thing, target, ..."""
+    named: tuple[str, ...]  # kinds of what the instruction names, in its order: thing, target, thing, ...
     n_objects: int = 6
-    n_bowls: int | None = None
-    """Number of bowls; uniform over the possible numbers when None."""
-    color_split: ColorSplit = "seen"
-    """Which colours the instruction may name."""
-    instructions: tuple[Instruction, ...] | None = None
-    """What the instruction asks for; drawn when None."""
-    blocks_in_bowls: int = 0
-    """How many blocks that the instruction does not name start in bowls that it does not name."""
-    target_in_bowl: bool = False
-    """Whether the first named block starts in a bowl that is not named."""
+    n_bowls: int | None = None  # number of bowls; uniform over the possible numbers when None
+    color_split: ColorSplit = "seen"  # which colours the instruction may name
+    instructions: tuple[Instruction, ...] | None = None  # what the instruction asks for; drawn when None
+    blocks_in_bowls: int = 0  # how many blocks that are not named start in bowls that are not named
+    target_in_bowl: bool = False  # whether the first named block starts in a bowl that is not named
+    spawn: Box2 = SPAWN  # where objects stand
+    edge: float = 0.0  # how far from the edge of that area their centres are, in footprints
 
     def __post_init__(self) -> None:
         if not len(self.named) <= self.n_objects <= MAX_OBJECTS:
@@ -67,24 +57,11 @@ class SceneRequest:
         low = self.named.count("bowl") + self.blocks_in_bowls + self.target_in_bowl
         return low, min(MAX_BOWLS, self.n_objects - self.named.count("block") - self.blocks_in_bowls)
 
-    def draw_n_bowls(self, rng: np.random.Generator) -> int:
-        """The number of bowls of one scene."""
-        low, high = self.bowl_range
-        return int(rng.integers(low, high + 1)) if self.n_bowls is None else self.n_bowls
-
 
 def sample_objects(
     rng: np.random.Generator, request: SceneRequest, n_bowls: int, named: Sequence[Thing], sizes: Sizes
 ) -> tuple[ObjectSpec, ...]:
-    """Draw the objects of a scene: the named things and others, no two colours alike, and their places.
-
-    Args:
-        rng: the source of chance.
-        request: what the scene must be like.
-        n_bowls: how many of the objects are bowls.
-        named: the things that the instruction names, of the kinds of ``request.named``.
-        sizes: of the objects.
-    """
+    """Draw the objects of a scene: the ``named`` things, others of other colours, and the places of all."""
     named_colors = [thing.color for thing in named]
     others = rng.permutation([color for color in COLORS if color not in named_colors]).tolist()
     n_blocks = request.n_objects - n_bowls
@@ -94,7 +71,7 @@ def sample_objects(
     # Ids carry no meaning: without the shuffle the target would always be object 0.
     things = [things[k] for k in rng.permutation(len(things))]
     insides = _draw_insides(rng, request, things, named)
-    places = _draw_places(rng, [thing.kind for thing in things], insides, sizes)
+    places = _draw_places(rng, request, [thing.kind for thing in things], insides, sizes)
     return tuple(
         ObjectSpec(thing.kind, thing.color, x, y, float(rng.uniform(-pi, pi)), insides.get(index))
         for index, (thing, (x, y)) in enumerate(zip(things, places, strict=True))
@@ -121,19 +98,19 @@ def _draw_insides(
 
 
 def _draw_places(
-    rng: np.random.Generator, kinds: list[str], insides: dict[int, int], sizes: Sizes
+    rng: np.random.Generator, request: SceneRequest, kinds: list[str], insides: dict[int, int], sizes: Sizes
 ) -> list[tuple[float, float]]:
     """Places such that no object touches or much hides another."""
     standing = [index for index in range(len(kinds)) if index not in insides]
     # Wide things first: a late bowl would find only gaps that fit a block.
     standing.sort(key=lambda index: -sizes.footprint(kinds[index]))
     for _ in range(MAX_TRIES):
-        places = _try_places(rng, kinds, standing, sizes)
-        if places is not None:
+        if (places := _try_places(rng, request, kinds, standing, sizes)) is not None:
             break
     else:
+        count = len(standing)
         raise ValueError(
-            f"{len(standing)} objects of this size do not fit on the table; use fewer, or a smaller scale"
+            f"{count} objects of this size do not fit on the table; use fewer, or a smaller scale"
         )
     for block, bowl in insides.items():
         # Within the millimetres that leave the block flat on the bowl's floor at any yaw.
@@ -144,11 +121,12 @@ def _draw_places(
 
 
 def _try_places(
-    rng: np.random.Generator, kinds: list[str], standing: list[int], sizes: Sizes
+    rng: np.random.Generator, request: SceneRequest, kinds: list[str], standing: list[int], sizes: Sizes
 ) -> dict[int, tuple[float, float]] | None:
     places: dict[int, tuple[float, float]] = {}
     for index in standing:
-        for x, y in rng.uniform((SPAWN.x[0], SPAWN.y[0]), (SPAWN.x[1], SPAWN.y[1]), size=(40, 2)).tolist():
+        area = request.spawn.shrunk(request.edge * sizes.footprint(kinds[index]))
+        for x, y in rng.uniform((area.x[0], area.y[0]), (area.x[1], area.y[1]), size=(40, 2)).tolist():
             if all(_apart(x - a, y - b, kinds[index], kinds[k], sizes) for k, (a, b) in places.items()):
                 places[index] = (x, y)
                 break

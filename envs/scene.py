@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.checks import check_choice
 from envs.colors import COLORS
-from envs.geometry import WORKSPACE, Sizes
+from envs.geometry import Box2, Sizes
 
 KINDS = ("block", "bowl")
-MAX_OBJECTS = 8
-"""As many objects as fit side by side into the workspace, each visible."""
+MAX_OBJECTS = 8  # as many objects as fit side by side into the workspace, each visible
+
+HELD_HEIGHT = 2.5
+"""A block whose centre is higher than this many blocks hangs at the arm: no two blocks reach so high."""
 
 
 class Thing(NamedTuple):
-    """An object as a sentence names it. No two objects of a scene share a colour."""
+    """An object as a sentence names it."""
 
     color: str
     kind: str
@@ -52,18 +56,25 @@ class GoalPair(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """One object of a layout. ``inside`` is the id of the bowl that a block lies in; ids count from 0."""
+    """One object of a layout; ids count from 0."""
 
     kind: str
     color: str
     x: float
     y: float
     yaw: float = 0.0
-    inside: int | None = None
+    inside: int | None = None  # the id of the bowl that a block lies in
+    on: int | None = None  # the id of the block that a block stands on
+    height: float | None = None  # of a block's centre (metres), if the arm holds it
 
     @property
     def thing(self) -> Thing:
         return Thing(self.color, self.kind)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it stands on the table itself."""
+        return self.inside is None and self.on is None and self.height is None
 
 
 @dataclass(frozen=True)
@@ -72,15 +83,22 @@ class Scene:
 
     objects: tuple[ObjectSpec, ...]
     goal: tuple[GoalPair, ...]
-    instruction: str
-    """The sentence that asks for the goal."""
+    instruction: str  # the sentence that asks for the goal
+
+    @property
+    def held(self) -> int:
+        """The id of the block that the arm holds, or -1."""
+        return next((index for index, item in enumerate(self.objects) if item.height is not None), -1)
 
 
-def read_layout(items: Any, sizes: Sizes) -> tuple[ObjectSpec, ...]:
+def read_layout(items: Any, sizes: Sizes, workspace: Box2, crowded: bool = False) -> tuple[ObjectSpec, ...]:
     """Check an explicit layout: a sequence of mappings with `kind`, `color`, `xy` (metres), optionally `yaw`.
 
     ``info["objects"]`` of an earlier `reset` is a layout too: `position` and `orientation` (a quaternion)
     stand for `xy` and `yaw`. A block whose centre is within a bowl's floor lies in that bowl.
+
+    With ``crowded``, objects may share a colour, and the third value of a `position` counts: a block that is
+    higher than another at the same place stands on it, and one much higher hangs at the arm.
 
     Raises:
         ValueError: for anything that is not such a layout, two objects of one colour, overlapping objects, or
@@ -88,36 +106,36 @@ def read_layout(items: Any, sizes: Sizes) -> tuple[ObjectSpec, ...]:
     """
     if isinstance(items, str | Mapping) or not isinstance(items, Iterable):
         raise ValueError(f"a layout is a list of objects such as {_EXAMPLE}, not {type(items).__name__}")
-    objects = [_read_object(item) for item in items]
+    objects = [_read_object(item, workspace) for item in items]
     if not 2 <= len(objects) <= MAX_OBJECTS:
         raise ValueError(f"a layout has 2 to {MAX_OBJECTS} objects, not {len(objects)}")
-    colors = [item.color for item in objects]
-    twice = sorted({color for color in colors if colors.count(color) > 1})
-    if twice:
-        raise ValueError(f"no two objects may share a colour, but {', '.join(twice)} is there more than once")
-    return tuple(_find_insides(objects, sizes))
+    if not crowded:
+        counts = Counter(item.color for item in objects)
+        if twice := ", ".join(sorted(color for color in counts if counts[color] > 1)):
+            raise ValueError(f"no two objects may share a colour, but {twice} is there more than once")
+        objects = [replace(item, height=None) for item in objects]
+    return tuple(_find_supports(objects, sizes))
 
 
 _EXAMPLE = "{'kind': 'block', 'color': 'red', 'xy': (0.5, 0.1)}"
 
 
-def _read_object(item: Any) -> ObjectSpec:
+def _read_object(item: Any, workspace: Box2) -> ObjectSpec:
     if not isinstance(item, Mapping):
         raise ValueError(f"an object of a layout is a mapping such as {_EXAMPLE}, not {item!r}")
     kind, color = item.get("kind"), item.get("color")
-    if kind not in KINDS:
-        raise ValueError(f"unknown kind {kind!r} in a layout; allowed: {', '.join(KINDS)}")
-    if color not in COLORS:
-        raise ValueError(f"unknown colour {color!r} in a layout; allowed: {', '.join(COLORS)}")
+    check_choice("kind", kind, KINDS, where=" in a layout", form=str)
+    check_choice("colour", color, COLORS, where=" in a layout", form=str)
     try:
         place = np.asarray(item["xy"] if "xy" in item else item["position"], dtype=float).ravel()
         x, y = float(place[0]), float(place[1])
+        height = float(place[2]) if len(place) > 2 and kind == "block" else None
         yaw = _yaw(item["orientation"]) if "orientation" in item else float(item.get("yaw", 0.0))
     except (KeyError, TypeError, ValueError, IndexError):
         raise ValueError(f"the {color} {kind} needs a place 'xy' in metres, as in {_EXAMPLE}") from None
-    if not (WORKSPACE.contains(x, y) and np.isfinite(yaw)):
-        raise ValueError(f"the {color} {kind} at ({x:g}, {y:g}) is out of the workspace: {WORKSPACE}")
-    return ObjectSpec(kind, color, x, y, yaw)
+    if not (workspace.contains(x, y) and np.isfinite(yaw)):
+        raise ValueError(f"the {color} {kind} at ({x:g}, {y:g}) is out of the workspace: {workspace}")
+    return ObjectSpec(str(kind), str(color), x, y, yaw, height=height)
 
 
 def _yaw(quaternion: Any) -> float:
@@ -125,32 +143,36 @@ def _yaw(quaternion: Any) -> float:
     return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-def _find_insides(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
-    """Mark the blocks that lie in bowls and refuse every other overlap."""
+def _find_supports(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
+    """Mark the blocks that lie in bowls, stand on blocks or hang at the arm, and refuse every other overlap."""
     placed: list[ObjectSpec] = []
+    radius = inside_radius(sizes)
     for item in objects:
-        inside = None
-        for index, other in enumerate(objects):
+        inside = on = None
+        held = item.height is not None and item.height > HELD_HEIGHT * sizes.block
+        for index, other in enumerate(objects if item.kind == "block" and not held else ()):
             distance = hypot(item.x - other.x, item.y - other.y)
-            if item.kind == "block" and other.kind == "bowl" and distance <= inside_radius(sizes):
+            if other.kind == "bowl" and distance <= radius:
                 inside = index
-        placed.append(ObjectSpec(item.kind, item.color, item.x, item.y, item.yaw, inside))
-    filled = [item.inside for item in placed if item.inside is not None]
-    for index in filled:
-        if filled.count(index) > 1:
-            raise ValueError(
-                f"the {placed[index].thing} has room for one block at the start, not {filled.count(index)}"
-            )
-    for index, item in enumerate(placed):
-        for other in placed[:index]:
-            if item.inside is not None or other.inside is not None:
-                continue
+            higher = other.kind == "block" and (item.height or 0) > (other.height or 0) + sizes.block / 2
+            if higher and distance <= max(radius, sizes.block / 2):
+                on = index
+        placed.append(replace(item, inside=inside, on=on, height=item.height if held else None))
+    if sum(item.height is not None for item in placed) > 1:
+        raise ValueError(
+            "the arm can hold one block at the start, not several; see the heights in the layout"
+        )
+    for bowl, count in Counter(item.inside for item in placed).items():
+        if bowl is not None and count > 1:
+            raise ValueError(f"the {placed[bowl].thing} has room for one block at the start, not {count}")
+    standing = [item for item in placed if item.stands]
+    for index, item in enumerate(standing):
+        for other in standing[:index]:
             needed = sizes.footprint(item.kind) + sizes.footprint(other.kind)
             if hypot(item.x - other.x, item.y - other.y) < needed:
                 raise ValueError(
                     f"the {item.thing} and the {other.thing} overlap; their centres must be at least "
-                    f"{needed:.3f} m apart, or a block within {inside_radius(sizes):.3f} m of a bowl's "
-                    "centre to lie in it"
+                    f"{needed:.3f} m apart, or a block within {radius:.3f} m of a bowl's centre to lie in it"
                 )
     return placed
 

@@ -10,11 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.geometry import WORKSPACE
+from envs.geometry import Box2
 from envs.physics.motion import MAX_SPEED, MAX_TURN
 
-EXTRAS = ("depth", "segmentation", "proprio")
-"""Observations beside `rgb` and `instruction`, on request."""
+EXTRAS = ("depth", "segmentation", "proprio")  # observations beside `rgb` and `instruction`, on request
 
 CHARSET = string.ascii_lowercase + " "
 """Characters an instruction is made of. Gymnasium's default charset for ``Text`` lacks the space."""
@@ -23,10 +22,10 @@ EE_NAMES = ("dx", "dy", "dz", "dyaw", "suction")
 PRIMITIVE_NAMES = ("pick_x", "pick_y", "place_x", "place_y", "yaw")
 
 
-def primitive_space(place_yaw: bool) -> spaces.Box:
+def primitive_space(workspace: Box2, place_yaw: bool) -> spaces.Box:
     """`[pick_x, pick_y, place_x, place_y]` in metres of the world frame, and with ``place_yaw`` radians."""
-    low = [WORKSPACE.x[0], WORKSPACE.y[0]] * 2 + [-pi] * place_yaw
-    high = [WORKSPACE.x[1], WORKSPACE.y[1]] * 2 + [pi] * place_yaw
+    low = [workspace.x[0], workspace.y[0]] * 2 + [-pi] * place_yaw
+    high = [workspace.x[1], workspace.y[1]] * 2 + [pi] * place_yaw
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
@@ -38,11 +37,7 @@ def ee_space(frame_time: float) -> spaces.Box:
 
 
 def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
-    """The action as float32.
-
-    Raises:
-        ValueError: when it is not a finite element of ``space``.
-    """
+    """The action as float32; ValueError when it is not a finite element of ``space``."""
     try:
         values = np.asarray(action, dtype=np.float32)
     except (TypeError, ValueError):
@@ -58,14 +53,7 @@ def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
 
 
 def observation_space(size: int, far: float, longest: int, extras: tuple[str, ...]) -> spaces.Dict:
-    """The space of observations.
-
-    Args:
-        size: height and width of the images.
-        far: the largest depth, metres.
-        longest: characters of the longest instruction.
-        extras: which of `EXTRAS` there are.
-    """
+    """Images of ``size`` with depths up to ``far`` metres, and sentences of up to ``longest`` characters."""
     parts: dict[str, spaces.Space[Any]] = {
         "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
         "instruction": spaces.Text(longest, min_length=1, charset=CHARSET),

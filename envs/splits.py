@@ -18,30 +18,23 @@ class Split:
 
     name: str
     number: int
-    task: str = "put_block_in_bowl"
-    """A name of `envs.tasks.TASKS`."""
+    task: str = "put_block_in_bowl"  # a name of `envs.tasks.TASKS`
     n_objects: int = 6
     color_split: ColorSplit = "seen"
-    bowls: tuple[int, int] = (1, 5)
-    """Fewest and most bowls; the number is uniform."""
+    bowls: tuple[int, int] = (1, 5)  # fewest and most bowls; the number is uniform
     mid_task: float = 0.38
     """Share of the episodes that shall start with 1 or 2 other blocks in bowls: what a second instruction
     finds. Two thirds of them have the bowls for it, which leaves about a quarter of all."""
     target_in_bowl: float = 0.13
     """Share of the episodes that shall name a block which lies in another bowl; a tenth of all remain."""
-    moved_arm: float = 0.10
-    """Share of the episodes that start with a perturbed arm."""
+    moved_arm: float = 0.10  # share of the episodes that start with a perturbed arm
 
     @property
     def first_seed(self) -> int:
         return self.number * SEEDS_PER_SPLIT
 
     def seed(self, episode: int) -> int:
-        """The seed of an episode.
-
-        Raises:
-            ValueError: when the split has no such episode.
-        """
+        """The seed of an episode; ValueError when the split has no such episode."""
         if not 0 <= episode < SEEDS_PER_SPLIT:
             raise ValueError(f"a split has episodes 0 to {SEEDS_PER_SPLIT - 1}, not {episode}")
         return self.first_seed + episode

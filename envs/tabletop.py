@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
 from math import dist
 from typing import Any, Literal, SupportsFloat
 
@@ -11,22 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.checks import check_choice, check_range
-from envs.colors import palette
-from envs.geometry import Sizes
+from envs.factors import Factors
 from envs.options import read_options
-from envs.physics.camera import PRESETS, Camera
 from envs.physics.motion import Action, pick_and_place
 from envs.physics.recorder import Recorder
-from envs.physics.robot import HOME, Robot
+from envs.physics.robot import Robot
 from envs.physics.simulation import FIRST_OBJECT, Tabletop
 from envs.scene import Scene
+from envs.scenes import make_setup
 from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
 from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
-EE_SECONDS = 5.0
-"""Time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s."""
-
+EE_SECONDS = 5.0  # time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s
 MAX_SETTLE_STEPS = 120
 HOME_TOLERANCE = 0.02
 """How close to its resting place, in metres, the arm must be for a solved episode to end."""
@@ -38,8 +37,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     ## Description
     The task says which sentences there are and when they are fulfilled: "put_block_in_bowl"
     (`PutBlockInBowl-v0`: put the named block into the named bowl), "put_blocks_in_bowls"
-    (`PutBlocksInBowls-v0`: 2 or 3 blocks, each into its bowl). A goal is a list of pairs of a thing that
-    shall move and a target at which it shall end.
+    (`PutBlocksInBowls-v0`: 2 or 3 blocks, each into its bowl). A goal is a list of (thing, target) pairs.
 
     ## Observation
     A dict: `rgb` (H, W, 3) uint8 and `instruction` (text). With ``extras``: `depth` (H, W) float32 in metres,
@@ -60,13 +58,13 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Info
     Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`,
-    `target` (goal pairs as an array (P, 2): the id of the object that shall move, the id of the object at
-    which it shall end), `objects` (a list of dicts with id, label (its value in the segmentation), kind,
-    color, position and orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`,
-    `table`), `camera` (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the
-    centre of the top-left pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1),
-    `sim_step`. With ``record_frames=True`` also `frames` (T, H, W, 3), `frame_segmentations` (T, H, W) and
-    `frame_states`: the frames of this step, or the one of `reset`.
+    `target` (goal pairs as an array (P, 2): ids of the object that shall move and of that at which it shall
+    end), `objects` (dicts with id, label (its value in the segmentation), kind, color, position and
+    orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`, `table`), `camera`
+    (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the centre of the top-left
+    pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in
+    this scene, see `envs.factors.Factors`), `sim_step`. With ``record_frames=True`` also `frames`,
+    `frame_segmentations` and `frame_states` of this step or of `reset`: see `envs.physics.recorder.Recorder`.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -75,26 +73,28 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     `instruction`; `layout`: a list of objects such as ``{"kind": "block", "color": "red", "xy": (0.5, 0.1)}``
     (``info["objects"]`` of an earlier reset is one too); or a random scene with `n_objects`, `n_bowls`,
     `color_split` ("seen", "unseen", "all"), `blocks_in_bowls` (how many other blocks start in bowls) and
-    `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles.
+    `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles; `factors`: values of an earlier
+    ``info["factors"]`` instead of random ones. Layout and factors together show the same scene again.
 
     Args:
+        scene: "simple" (made easy), "cliport" (CLIPort's table, robot, grays, light and speed, in the paper's
+            view) or "varied" (the same with random factors).
         task: a name of `envs.tasks.TASKS`, or a task of your own.
-        n_pairs: how many pairs a random goal has; by default the task's fewest. An instruction in `reset`'s
-            options may name from 1 to the task's most.
+        n_pairs: how many pairs a random goal has; by default the task's fewest. A given instruction may name
+            1 to the task's most.
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
-        camera: "close" (the workspace fills the frame) or "paper" (the camera of the paper's frames).
+        camera: "close" (a narrow workspace fills the frame) or "paper"; by default the scene's own.
+        sizes: "paper" (blocks of 5.8 cm, bowls of 14 cm) or "cliport" (4 cm, 11.4 cm); by default the scene's.
+        factors: ranges of what varies from scene to scene; by default the scene's.
         object_scale: scales blocks and bowls, 0.5 to 1; at 1 they are the paper's, and 8 of them just fit.
         render_stride: physics steps between two camera frames.
-        physics_hz: physics steps per second.
+        physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
         max_steps: steps until truncation; by default 3 primitives or 75 frames for each goal pair.
         extras: further observations, of "depth", "segmentation", "proprio".
         place_yaw: whether a primitive has a fifth value.
         record_frames: whether `info` holds all frames of a step.
         render_mode: "rgb_array", "human" or None.
-
-    ## History
-    v0: first version.
     """
 
     # Not a ClassVar, because Gymnasium declares it so.
@@ -106,15 +106,18 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         n_pairs: int | None = None,
         control: Literal["primitive", "ee"] = "primitive",
         image_size: int = 64,
-        camera: str = "close",
+        camera: str | None = None,
         object_scale: float = 1.0,
         render_stride: int = 16,
-        physics_hz: int = 240,
+        physics_hz: int | None = None,
         max_steps: int | None = None,
         extras: Sequence[str] = (),
         place_yaw: bool = False,
         record_frames: bool = False,
         render_mode: str | None = None,
+        scene: str = "simple",
+        sizes: str | None = None,
+        factors: Factors | None = None,
     ) -> None:
         if isinstance(task, str):
             check_choice("task", task, TASKS)
@@ -122,12 +125,12 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.n_pairs = self.task.pairs[0] if n_pairs is None else n_pairs
         check_range("n_pairs", self.n_pairs, *self.task.pairs, whole=True)
         check_choice("control", control, ("primitive", "ee"))
-        check_choice("camera", camera, PRESETS)
+        self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         for extra in extras:
             check_choice("extras", extra, EXTRAS)
         check_range("image_size", image_size, 16, 2048, whole=True)
-        check_range("object_scale", object_scale, 0.5, 1.0)
+        physics_hz = setup.physics_hz if physics_hz is None else physics_hz
         check_range("physics_hz", physics_hz, 120, 2000, whole=True)
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
         if max_steps is not None:
@@ -137,19 +140,19 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         per_pair = 3 if control == "primitive" else round(EE_SECONDS * physics_hz / render_stride)
         self.max_steps = max_steps or per_pair * self.n_pairs
         self.metadata = self.metadata | {"render_fps": max(1, round(physics_hz / render_stride))}
-        self.camera = Camera(PRESETS[camera], image_size)
-        primitive = control == "primitive"
-        self._box = primitive_space(place_yaw) if primitive else ee_space(render_stride / physics_hz)
+        if control == "primitive":
+            self._box = primitive_space(setup.workspace, place_yaw)
+        else:
+            self._box = ee_space(render_stride / physics_hz)
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
         self.observation_space = observation_space(
-            image_size, self.camera.preset.far, self.task.longest_sentence, self.extras
+            image_size, setup.camera.far, self.task.longest_sentence, self.extras
         )
-        self.world = Tabletop(
-            self.camera, Sizes().scaled(object_scale), physics_hz, gui=render_mode == "human"
-        )
+        self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
         self.robot = Robot(self.world, render_stride)
-        self._recorder = Recorder(self.world, self.robot)
+        self._recorder = Recorder(self.robot)
         self._scene: Scene | None = None
+        self._drawn: dict[str, Any] = {}
         self._elapsed = 0
 
     @property
@@ -171,11 +174,12 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: for options that are not allowed, before anything changes.
         """
-        checked = read_options(options, self.task, self.task.request(self.n_pairs), self.world.sizes)
+        request = replace(self.task.request(self.n_pairs), spawn=self.setup.spawn, edge=self.setup.edge)
+        checked = read_options(options, self.task, request, self.setup)
         super().reset(seed=seed)
-        scene, joints = checked.draw(self.np_random, self.world.sizes)
-        self.world.build(scene, joints)
-        self.robot.reset(joints)
+        setup, self._drawn, scene, joints = checked.draw(self.np_random)
+        self.world.build(setup, scene, joints)
+        self.robot.reset(joints, scene.held)
         self.robot.hold_still(MAX_SETTLE_STEPS)
         self._scene, self._elapsed = scene, 0
         self._recorder.restart()
@@ -195,9 +199,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         values = check_action(self._box, action)
         self._recorder.restart()
         if self.control == "primitive":
-            turn = float(values[4]) if self.place_yaw else 0.0
-            pick, place = (float(values[0]), float(values[1])), (float(values[2]), float(values[3]))
-            for motion in pick_and_place(self.robot, pick, place, turn):
+            x, y, place_x, place_y, *turn = values.tolist()
+            for motion in pick_and_place(self.robot, (x, y), (place_x, place_y), *turn):
                 self._move(motion)
                 # Rendering changes nothing in the world, so unwanted frames are not drawn.
                 if self.record_frames or self.render_mode == "human":
@@ -231,43 +234,35 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         return [self.task.relation(pair).fulfilled(self.world, self.robot, pair) for pair in self.scene.goal]
 
     def _is_home(self) -> bool:
-        return dist(self.robot.state().position, HOME) < HOME_TOLERANCE
+        return dist(self.robot.tip(), self.robot.arm.home) < HOME_TOLERANCE
 
     def _observe(self) -> Observation:
-        image, observation = self._recorder.images[-1], {}
-        observation["rgb"] = image.rgb.copy()
-        observation["instruction"] = self.scene.instruction
-        if "depth" in self.extras:
-            observation["depth"] = image.depth.copy()
-        if "segmentation" in self.extras:
-            observation["segmentation"] = image.segmentation.copy()
-        if "proprio" in self.extras:
-            state = self._recorder.states[-1]
-            observation["proprio"] = np.concatenate([state["arm"], state["gripper"]])
-        return observation
+        image, state = self._recorder.images[-1], self._recorder.states[-1]
+        extras = {
+            "depth": image.depth.copy(),
+            "segmentation": image.segmentation.copy(),
+            "proprio": np.concatenate([state["arm"], state["gripper"]]),
+        }
+        always = {"rgb": image.rgb.copy(), "instruction": self.scene.instruction}
+        return always | {name: extras[name] for name in EXTRAS if name in self.extras}
 
     def _info(self) -> dict[str, Any]:
-        world, goal, grip = self.world, self.scene.goal, self.robot.state()
+        world, robot, goal = self.world, self.robot, self.scene.goal
         info: dict[str, Any] = {
             "is_success": all(self._fulfilled()),
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
             "target": np.array([(pair.thing, pair.target) for pair in goal]),
-            "objects": self._object_infos(),
+            "objects": [],
             "segmentation": self._recorder.images[-1].segmentation.copy(),
-            "palette": palette(),
-            "camera": {"intrinsics": self.camera.intrinsics, "extrinsics": self.camera.extrinsics},
-            "gripper": {"position": np.array(grip.position), "yaw": grip.yaw, "holding": grip.holding},
+            "palette": world.setup.palette,
+            "camera": {"intrinsics": world.camera.intrinsics, "extrinsics": world.camera.extrinsics},
+            "gripper": {"position": np.array(robot.tip()), "yaw": robot.yaw, "holding": robot.holding},
             "sim_step": world.steps,
+            "factors": deepcopy(self._drawn),
         }
-        if self.record_frames:
-            info |= self._recorder.info()
-        return info
-
-    def _object_infos(self) -> list[dict[str, Any]]:
-        infos = []
         for index, item in enumerate(self.scene.objects):
-            position, orientation = map(np.array, self.world.pose(index))
+            position, orientation = map(np.array, world.pose(index))
             named = {"id": index, "label": FIRST_OBJECT + index, "kind": item.kind, "color": item.color}
-            infos.append(named | {"position": position, "orientation": orientation})
-        return infos
+            info["objects"].append(named | {"position": position, "orientation": orientation})
+        return info | (self._recorder.info() if self.record_frames else {})

@@ -8,24 +8,22 @@ from math import cos, radians, sin, tan
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.geometry import Point
+
 
 @dataclass(frozen=True)
 class CameraPreset:
     """A place to look from. Metres and degrees; the image is square, so ``aspect`` squashes it."""
 
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fov: float
-    """Vertical field of view."""
-    aspect: float = 1.0
-    """Tangent of half the horizontal field of view over that of the vertical one."""
+    eye: Point
+    target: Point
+    fov: float  # vertical field of view
+    aspect: float = 1.0  # tangent of half the horizontal field of view over that of the vertical one
     near: float = 0.1
     far: float = 10.0
 
 
-def _looking_at(
-    target: tuple[float, float, float], distance: float, pitch: float, fov: float
-) -> CameraPreset:
+def _looking_at(target: Point, distance: float, pitch: float, fov: float) -> CameraPreset:
     eye = (target[0] + distance * cos(radians(pitch)), target[1], target[2] + distance * sin(radians(pitch)))
     return CameraPreset(eye, target, fov, near=distance - 1.0, far=distance + 1.0)
 
@@ -41,25 +39,21 @@ PRESETS: dict[str, CameraPreset] = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A preset at an image size.
-
-    Pixels: u to the right, v down, and the centre of the top-left pixel is (u, v) = (0.5, 0.5).
-    """
+    """A preset at an image size. Pixels: u right, v down; the top-left pixel's centre is (0.5, 0.5)."""
 
     preset: CameraPreset
     size: int
+    oversampling: int = 1  # pixels average this many drawn ones along each axis; masks show the central one
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy.
-
-        PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured:
-        masks sit half a pixel right and up of the projected bodies, at any image size), hence the halves in
-        cx and cy.
-        """
-        half = self.size / 2
+        """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy."""
+        # PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured: masks
+        # sit half a pixel right and up of the projected bodies, at any image size), hence the shift. Of an even
+        # number of drawn pixels one has that corner at the centre of their average.
+        half, shift = self.size / 2, (self.oversampling % 2) / (2 * self.oversampling)
         fy = half / tan(radians(self.preset.fov) / 2)
-        return np.array([[fy / self.preset.aspect, 0, half + 0.5], [0, fy, half - 0.5], [0, 0, 1]])
+        return np.array([[fy / self.preset.aspect, 0, half + shift], [0, fy, half - shift], [0, 0, 1]])
 
     @property
     def extrinsics(self) -> NDArray[np.float64]:
@@ -90,12 +84,13 @@ class Camera:
         """OpenGL's projection matrix, column-major."""
         near, far = self.preset.near, self.preset.far
         scale = 1 / tan(radians(self.preset.fov) / 2)
-        matrix = np.zeros((4, 4))
-        matrix[0, 0], matrix[1, 1] = scale / self.preset.aspect, scale
-        matrix[2, 2], matrix[2, 3], matrix[3, 2] = (
-            (far + near) / (near - far),
-            2 * far * near / (near - far),
-            -1,
+        matrix = np.array(
+            [
+                [scale / self.preset.aspect, 0, 0, 0],
+                [0, scale, 0, 0],
+                [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)],
+                [0, 0, -1, 0],
+            ]
         )
         return matrix.T.ravel().tolist()
 

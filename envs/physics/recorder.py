@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.robot import Robot
-from envs.physics.simulation import Image, Tabletop
+from envs.physics.simulation import Image
 
 
 class Recorder:
@@ -19,8 +19,8 @@ class Recorder:
     quaternions x y z w.
     """
 
-    def __init__(self, world: Tabletop, robot: Robot) -> None:
-        self._world, self._robot = world, robot
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
         self.restart()
 
     def restart(self) -> None:
@@ -30,25 +30,22 @@ class Recorder:
 
     def capture(self) -> None:
         """Add the frame of this moment."""
-        grip = self._robot.state()
-        position, orientation = self._world.poses()
-        self.images.append(self._world.render())
-        self.states.append(
-            {
-                "arm": self._robot.joints().astype(np.float32),
-                "gripper": np.array([*grip.position, grip.yaw, grip.holding >= 0], dtype=np.float32),
-                "object_position": position.astype(np.float32),
-                "object_orientation": orientation.astype(np.float32),
-            }
-        )
+        robot = self._robot
+        self.images.append(robot.world.render())
+        position, orientation = robot.world.poses()
+        state = {
+            "arm": robot.joints(),
+            "gripper": np.array([*robot.tip(), robot.yaw, robot.holding >= 0]),
+            "object_position": position,
+            "object_orientation": orientation,
+        }
+        self.states.append({name: value.astype(np.float32) for name, value in state.items()})
 
     def info(self) -> dict[str, Any]:
-        """All T frames, stacked: `frames` (T, H, W, 3), `frame_segmentations` (T, H, W), and `frame_states`, a
-        dict of the states' values (T, ...)."""
+        """All T frames: `frames` (T, H, W, 3), `frame_segmentations` (T, H, W), `frame_states` (dict of (T, ...))."""
+        names = self.states[0]
         return {
             "frames": np.stack([image.rgb for image in self.images]),
             "frame_segmentations": np.stack([image.segmentation for image in self.images]),
-            "frame_states": {
-                name: np.stack([state[name] for state in self.states]) for name in self.states[0]
-            },
+            "frame_states": {name: np.stack([state[name] for state in self.states]) for name in names},
         }

@@ -5,60 +5,37 @@ Both control modes of the environments run over this one controller, one camera 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import pi
 
 import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 
-from envs.physics.arm import TIP_LINK, Joints, Point, forward_kinematics, inverse_kinematics
+from envs.geometry import Point
+from envs.physics.arm import TIP_LINK, Joints
 from envs.physics.simulation import Tabletop
 
-HOME: Point = (0.348, 0.0, 0.13)
-"""Where the tip rests: seen at the upper edge of the `close` view, in front of no object."""
-
-HOME_JOINTS: Joints = inverse_kinematics(HOME, 0.0)
-
-REACH_LOW: Point = (0.20, -0.30, 0.006)
-REACH_HIGH: Point = (0.78, 0.30, 0.25)
-"""The tip's commanded place is kept within these corners (metres); all of it can be reached."""
-
-CONTACT = 0.002
-"""Gap in metres at which the suction cup seals, and at which a downward motion stops."""
-
-FORCE = 400.0
-"""Motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject."""
-
-
-@dataclass(frozen=True)
-class GripperState:
-    """What the gripper is doing."""
-
-    position: Point
-    """The tip, in metres."""
-    yaw: float
-    """Radians."""
-    holding: int
-    """Id of the held object, or -1."""
+JOINTS = list(range(6))
+CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops
+FORCE = 400.0  # motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject
 
 
 class Robot:
     """The arm controller on a built `Tabletop`."""
 
     def __init__(self, world: Tabletop, frame_steps: int) -> None:
-        self.world = world
-        self.frame_steps = frame_steps
-        self._joints = list(range(6))
-        self.reset(HOME_JOINTS)
+        self.world, self.frame_steps = world, frame_steps
+        self.reset(world.setup.arm.home_joints)
 
-    def reset(self, joints: Joints) -> None:
-        """Take over an arm that was just built at ``joints`` (tool upright)."""
-        self.target, self.yaw = forward_kinematics(joints)
-        self.holding = -1
+    def reset(self, joints: Joints, holding: int = -1) -> None:
+        """Take over an arm that was just built at ``joints`` (tool upright), ``holding`` a block or nothing."""
+        self.arm = self.world.setup.arm
+        self.target, self.yaw = self.arm.forward(joints)
+        self.holding = self._grip = -1
         self.touched = False
-        self._grip = -1
         self._angles = np.array(joints)
+        if holding >= 0:
+            self._seal(holding)
 
     @property
     def frame_time(self) -> float:
@@ -77,7 +54,7 @@ class Robot:
         ``suction`` on, a block that the cup touches is held; without, it is let go.
         """
         start, yaw = np.array(self.target), self.yaw
-        end = np.clip(start + delta, REACH_LOW, REACH_HIGH)
+        end = np.array(self.arm.within_reach(tuple(start + delta)))
         lowering = bool(end[2] < start[2])
         self.touched = False
         if not suction:
@@ -86,88 +63,74 @@ class Robot:
             share = step / self.frame_steps
             self.target = tuple(start + share * (end - start))
             self.yaw = yaw + share * dyaw
-            self._drive(np.array(inverse_kinematics(self.target, self.yaw)))
+            self._drive(np.array(self.arm.inverse(self.target, self.yaw)))
             self.world.step()
             if suction and self.holding < 0:
                 self._try_grip()
             if lowering and not self.touched and self._feels_contact():
                 # The tip lags a little behind its command: stop where it is, not where it was going to be.
                 self.touched = True
-                start[2] = end[2] = min(start[2], self.state().position[2])
+                start[2] = end[2] = min(start[2], self.tip()[2])
         # Full turns do not matter, and yaw must not grow without bound over a long episode.
         self.yaw = (self.yaw + pi) % (2 * pi) - pi
 
-    def state(self) -> GripperState:
-        """Where the tip really is, and what it holds."""
-        position = p.getLinkState(self.world.arm, TIP_LINK, physicsClientId=self.world.client)[4]
-        return GripperState(position, self.yaw, self.holding)
+    def tip(self) -> Point:
+        """Where the tip really is, in metres."""
+        return self.world.bullet.getLinkState(self.world.arm, TIP_LINK)[4]
 
     def joints(self) -> NDArray[np.float64]:
         """Joint angles (6,) in radians."""
-        states = p.getJointStates(self.world.arm, self._joints, physicsClientId=self.world.client)
-        return np.array([state[0] for state in states])
+        return np.array([state[0] for state in self.world.bullet.getJointStates(self.world.arm, JOINTS)])
 
     def _drive(self, angles: NDArray[np.float64]) -> None:
         # Wrist3 may take the short way round only at ±pi, which a change of 2 pi would spoil.
         change = (angles - self._angles + pi) % (2 * pi) - pi
         angles = self._angles + change
-        p.setJointMotorControlArray(
+        self.world.bullet.setJointMotorControlArray(
             self.world.arm,
-            self._joints,
+            JOINTS,
             p.POSITION_CONTROL,
             targetPositions=angles.tolist(),
             targetVelocities=(change * self.world.physics_hz).tolist(),
             forces=[FORCE] * 6,
             positionGains=[0.5] * 6,
             velocityGains=[1.0] * 6,
-            physicsClientId=self.world.client,
         )
         self._angles = angles
 
     def _touching(self, body: int, link: int) -> list[int]:
         """Bodies that a link touches."""
-        points = p.getContactPoints(bodyA=body, linkIndexA=link, physicsClientId=self.world.client)
+        points = self.world.bullet.getContactPoints(bodyA=body, linkIndexA=link)
         return [point[2] for point in points if point[8] < CONTACT]
 
     def _feels_contact(self) -> bool:
-        if self.holding >= 0:
-            held = self.world.objects[self.holding]
-            return any(body != self.world.arm for body in self._touching(held, -1))
-        return bool(self._touching(self.world.arm, TIP_LINK))
+        if self.holding < 0:
+            return bool(self._touching(self.world.arm, TIP_LINK))
+        held = self.world.objects[self.holding]
+        return any(body != self.world.arm for body in self._touching(held, -1))
 
     def _try_grip(self) -> None:
-        for body in self._touching(self.world.arm, TIP_LINK):
-            # A bowl has no flat top to seal on.
-            if body in self.world.blocks:
-                self._seal(self.world.objects.index(body))
-                return
+        # A bowl has no flat top to seal on.
+        blocks = [body for body in self._touching(self.world.arm, TIP_LINK) if body in self.world.blocks]
+        if blocks:
+            self._seal(self.world.objects.index(blocks[0]))
 
     def _seal(self, index: int) -> None:
         """Fix the block to the cup as it stands."""
-        client, body = self.world.client, self.world.objects[index]
-        link = p.getLinkState(self.world.arm, TIP_LINK, physicsClientId=client)
-        inverse = p.invertTransform(link[4], link[5])
-        place = p.multiplyTransforms(*inverse, *self.world.pose(index))
-        self._grip = p.createConstraint(
-            self.world.arm,
-            TIP_LINK,
-            body,
-            -1,
-            p.JOINT_FIXED,
-            [0, 0, 0],
-            place[0],
-            [0, 0, 0],
-            place[1],
-            physicsClientId=client,
+        world, body = self.world, self.world.objects[index]
+        link = world.bullet.getLinkState(world.arm, TIP_LINK)
+        place, turn = p.multiplyTransforms(*p.invertTransform(link[4], link[5]), *world.pose(index))
+        self._grip = world.bullet.createConstraint(
+            world.arm, TIP_LINK, body, -1, p.JOINT_FIXED, [0, 0, 0], place, [0, 0, 0], turn
         )
         # Cup and block would fight: the constraint holds them where the contact pushes them apart.
-        p.setCollisionFilterPair(self.world.arm, body, TIP_LINK, -1, 0, physicsClientId=client)
+        world.bullet.setCollisionFilterPair(world.arm, body, TIP_LINK, -1, 0)
         self.holding = index
 
     def _release(self) -> None:
         if self.holding < 0:
             return
-        client, body = self.world.client, self.world.objects[self.holding]
-        p.removeConstraint(self._grip, physicsClientId=client)
-        p.setCollisionFilterPair(self.world.arm, body, TIP_LINK, -1, 1, physicsClientId=client)
+        world, body = self.world, self.world.objects[self.holding]
+        world.bullet.removeConstraint(self._grip)
+        world.bullet.setCollisionFilterPair(world.arm, body, TIP_LINK, -1, 1)
         self.holding = -1

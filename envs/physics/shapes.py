@@ -6,18 +6,18 @@ import hashlib
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from itertools import pairwise
 from math import cos, hypot, pi, sin
 from pathlib import Path
 
 from envs.geometry import Sizes
 
-SEGMENTS = 24
-"""Corners of the bowl's circle as seen."""
+SEGMENTS = 24  # corners of the bowl's circle as seen
+ARC = 5  # bands of a round wall
+STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
 
-WALL_PARTS = 12
-"""Convex parts of the bowl's wall as felt: one per wall segment. A block's edge never meets their corners."""
+WALL_PARTS = 12  # convex parts of the bowl's wall as felt; a block's edge never meets their corners
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,14 @@ class Mesh:
     indices: list[int]
 
 
-@cache
-def bowl_mesh(sizes: Sizes) -> Mesh:
-    """The visible bowl: a lathed profile, smooth around the axis, with an edge between two bands of the
-    profile."""
-    profile = _bowl_profile(sizes)
+@lru_cache(maxsize=16)
+def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
+    """The visible bowl, conical or ``rounded``: a lathed profile, smooth around, with an edge between bands."""
+    profile = _round_profile(sizes) if rounded else _bowl_profile(sizes)
     vertices: list[list[float]] = []
     normals: list[list[float]] = []
     indices: list[int] = []
-    for (r0, z0), (r1, z1) in pairwise(profile):
+    for band, ((r0, z0), (r1, z1)) in enumerate(pairwise(profile)):
         length = hypot(r1 - r0, z1 - z0)
         # The profile runs with the solid on its left, so the outward normal is its direction turned right.
         normal_r, normal_z = (z1 - z0) / length, -(r1 - r0) / length
@@ -45,7 +44,11 @@ def bowl_mesh(sizes: Sizes) -> Mesh:
         for k in range(SEGMENTS + 1):
             c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
             vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
-            normals += [[normal_r * c, normal_r * s, normal_z]] * 2
+            ends = [(normal_r, normal_z)] * 2
+            if rounded and ARC < band <= 2 * ARC:
+                # As CLIPort's bowls look: the inner wall is shaded as if steep, the lowest band as a star.
+                ends = [(-1.0, 0.0)] * 2 if band < 2 * ARC else [STAR[k % 3], (0.0, 1.0)]
+            normals += [[r * c, r * s, z] for r, z in ends]
         for k in range(SEGMENTS):
             a = first + 2 * k
             if r0 > 0:
@@ -66,14 +69,23 @@ def _bowl_profile(sizes: Sizes) -> list[tuple[float, float]]:
     ]
 
 
-@cache
-def bowl_contact_file(sizes: Sizes) -> str:
-    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its
-    wall.
+def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
+    """The same for a bowl that is round inside and outside."""
+    flat, height = 0.45 * sizes.bowl_radius, sizes.bowl_height
 
-    A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
-    several parts; PyBullet turns each group of an OBJ file into one convex hull.
-    """
+    def arc(rim: float, low: float) -> list[tuple[float, float]]:
+        angles = [pi / 2 * k / ARC for k in range(ARC + 1)]
+        return [(flat + (rim - flat) * sin(a), low + (height - low) * (1 - cos(a))) for a in angles]
+
+    outside, inside = arc(sizes.bowl_radius, 0.0), arc(sizes.bowl_inner_radius, sizes.bowl_floor)
+    return [*outside, *reversed(inside), (0.0, sizes.bowl_floor)]
+
+
+@lru_cache(maxsize=16)
+def bowl_contact_file(sizes: Sizes) -> str:
+    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its wall."""
+    # A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
+    # several parts; PyBullet turns each group of an OBJ file into one convex hull.
     lines: list[str] = []
     count = 0
 
@@ -106,15 +118,12 @@ def bowl_contact_file(sizes: Sizes) -> str:
 
 
 def generated_file(stem: str, suffix: str, text: str) -> str:
-    """Write ``text`` once into the user's temporary folder and return the path; its name carries the
-    content's hash.
-
-    Written beside and renamed, so that processes that start together never read half a file.
-    """
+    """Path of a file with ``text`` in the user's temporary folder; its name carries the content's hash."""
     folder = Path(tempfile.gettempdir()) / f"textocvp-envs-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
     folder.mkdir(exist_ok=True)
     path = folder / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}{suffix}"
     if not path.exists() or path.read_text() != text:
+        # Renamed when whole, so that processes that start together never read half a file.
         part = path.with_suffix(f".{os.getpid()}.part")
         part.write_text(text)
         part.replace(path)

@@ -6,11 +6,13 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from math import dist
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from envs.checks import check_choice
 from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
 from envs.geometry import Sizes
 from envs.physics.robot import Robot
@@ -18,21 +20,18 @@ from envs.physics.simulation import Tabletop
 from envs.sampling import SceneRequest, sample_objects
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
-CLIPORT_RADIUS = 0.05
-"""CLIPort calls it success when an object is this close to its place in the plane (metres)."""
-
-SETTLED_SPEED = 0.05
-"""In m/s. A resting block of a few grams jitters by up to a fifth of this in PyBullet's contact solver."""
+CLIPORT_RADIUS = (
+    0.05  # CLIPort calls it success when an object is this close to its place in the plane (metres)
+)
+SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver
 
 
 class Question(NamedTuple):
     """A sentence of one step that a scene allows."""
 
     text: str
-    moves: int
-    """Id of the object that should move."""
-    ends_at: int
-    """Id of the object at which it should end."""
+    moves: int  # id of the object that should move
+    ends_at: int  # id of the object at which it should end
 
 
 class Relation(ABC):
@@ -41,12 +40,9 @@ class Relation(ABC):
     The expert picks at the thing and lets go at `place`.
     """
 
-    name: ClassVar[str]
-    """The words between thing and target, such as "in"."""
-    kinds: ClassVar[tuple[str, str]]
-    """Kinds of the thing, which moves, and of the target, at which it ends."""
-    exclusive: ClassVar[bool] = False
-    """Whether a target has room for one thing only."""
+    name: ClassVar[str]  # the words between thing and target, such as "in"
+    kinds: ClassVar[tuple[str, str]]  # kinds of the thing, which moves, and of the target, at which it ends
+    exclusive: ClassVar[bool] = False  # whether a target has room for one thing only
 
     def between(self, thing_color: str, target_color: str) -> Instruction:
         """The instruction that asks for it."""
@@ -79,8 +75,7 @@ class Task:
     """
 
     relations: tuple[Relation, ...]
-    pairs: tuple[int, int] = (1, 1)
-    """Fewest and most (thing, target) pairs of a random goal. A given instruction has 1 to the most."""
+    pairs: tuple[int, int] = (1, 1)  # fewest and most of a random goal; a given instruction has 1 to the most
 
     @property
     def grammar(self) -> str:
@@ -102,11 +97,7 @@ class Task:
         return max(len(self.format([r.between(color, color)] * self.pairs[1])) for r in self.relations)
 
     def format(self, instructions: Iterable[Instruction]) -> str:
-        """The sentence that asks for ``instructions``, in their order.
-
-        Raises:
-            ValueError: for no instruction at all, or a colour that does not exist.
-        """
+        """The sentence that asks for ``instructions``; ValueError for none, or a colour that does not exist."""
         steps = list(instructions)
         if not steps:
             raise ValueError("a sentence needs at least one instruction")
@@ -140,15 +131,11 @@ class Task:
         return tuple(steps)
 
     def check_instructions(self, instructions: Sequence[Instruction]) -> None:
-        """Refuse what no scene of the task can be asked for.
-
-        Raises:
-            ValueError: for too many instructions, or a target named twice that has room for one thing.
-        """
-        if len(instructions) > self.pairs[1]:
+        """Raise ValueError for too many instructions, or a target named twice that has room for one thing."""
+        count, most = len(instructions), self.pairs[1]
+        if count > most:
             raise ValueError(
-                f"this environment takes instructions of at most {self.pairs[1]} (thing, target) pairs, "
-                f"not {len(instructions)}"
+                f"this environment takes instructions of at most {most} (thing, target) pairs, not {count}"
             )
         for relation in self.relations:
             targets = [step.target for step in instructions if step.relation == relation.name]
@@ -162,20 +149,15 @@ class Task:
         """The relation that a goal pair or an instruction names."""
         return next(relation for relation in self.relations if relation.name == step.relation)
 
-    def find_goal(
-        self, objects: Sequence[ObjectSpec], instructions: Iterable[Instruction]
-    ) -> tuple[GoalPair, ...]:
-        """The ids of what is named.
-
-        Raises:
-            ValueError: when the scene does not have a named thing.
-        """
-        ids = {item.thing: index for index, item in enumerate(objects)}
-        steps = tuple(instructions)
+    def find_goal(self, objects: Sequence[ObjectSpec], steps: Sequence[Instruction]) -> tuple[GoalPair, ...]:
+        """The ids of what is named; ValueError when the scene does not have exactly one thing called so."""
+        things = [item.thing for item in objects]
+        ids = {thing: index for index, thing in enumerate(things)}
         for thing in (thing for step in steps for thing in step.things):
             if thing not in ids:
-                there = ", ".join(str(item.thing) for item in objects)
-                raise ValueError(f"the scene has no {thing}; it has: {there}")
+                raise ValueError(f"the scene has no {thing}; it has: {', '.join(map(str, things))}")
+            if things.count(thing) > 1:
+                raise ValueError(f"the scene has {things.count(thing)} objects that are a {thing}")
         return tuple(GoalPair(step.relation, ids[step.thing], ids[step.target]) for step in steps)
 
     def request(self, n_pairs: int = 1) -> SceneRequest:
@@ -184,8 +166,12 @@ class Task:
 
     def sample(self, rng: np.random.Generator, request: SceneRequest, sizes: Sizes) -> Scene:
         """Draw a scene: kinds, colours, a goal that is not reached yet, and places."""
-        n_bowls = request.draw_n_bowls(rng)
-        steps = request.instructions or self._draw_instructions(rng, request)
+        low, high = request.bowl_range
+        n_bowls = int(rng.integers(low, high + 1)) if request.n_bowls is None else request.n_bowls
+        steps = request.instructions
+        if not steps:
+            colors = rng.permutation(CAPTION_COLORS[request.color_split])[: len(request.named)].tolist()
+            steps = tuple(map(self.relations[0].between, colors[::2], colors[1::2]))
         objects = sample_objects(rng, request, n_bowls, [t for step in steps for t in step.things], sizes)
         return self.scene(objects, self.find_goal(objects, steps))
 
@@ -214,9 +200,8 @@ class Task:
         pairs = self.open_pairs(objects, color_split)
         while pairs and len(goal) < n_pairs:
             goal.append(pairs[int(rng.integers(len(pairs)))])
-            pairs = [
-                pair for pair in pairs if pair.thing != goal[-1].thing and pair.target != goal[-1].target
-            ]
+            _, thing, target = goal[-1]
+            pairs = [pair for pair in pairs if pair.thing != thing and pair.target != target]
         return tuple(goal)
 
     def questions(self, objects: Sequence[ObjectSpec]) -> tuple[Question, ...]:
@@ -227,14 +212,14 @@ class Task:
         )
 
     def _pairs(self, objects: Sequence[ObjectSpec]) -> list[GoalPair]:
-        """All pairs of objects of the right kinds."""
-        ids = range(len(objects))
+        """All pairs of objects of the right kinds that have a name of their own and nothing on top."""
+        things, covered = [item.thing for item in objects], {item.on for item in objects}
+        ids = [i for i, thing in enumerate(things) if things.count(thing) == 1 and i not in covered]
         return [
             GoalPair(relation.name, thing, target)
             for relation in self.relations
-            for thing in ids
-            for target in ids
-            if thing != target and (objects[thing].kind, objects[target].kind) == relation.kinds
+            for thing, target in permutations(ids, 2)
+            if (objects[thing].kind, objects[target].kind) == relation.kinds
         ]
 
     def _parse_step(self, part: str) -> Instruction | None:
@@ -243,12 +228,7 @@ class Task:
                 return relation.between(*match.groups())
         return None
 
-    def _draw_instructions(self, rng: np.random.Generator, request: SceneRequest) -> tuple[Instruction, ...]:
-        colors = rng.permutation(CAPTION_COLORS[request.color_split])[: len(request.named)].tolist()
-        return tuple(map(self.relations[0].between, colors[::2], colors[1::2]))
-
 
 def _check_colors(step: Instruction) -> None:
     for thing in step.things:
-        if thing.color not in COLORS:
-            raise ValueError(f"unknown colour {thing.color!r}; allowed: {', '.join(COLORS)}")
+        check_choice("colour", thing.color, COLORS, form=str)

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 import pytest
 
 from envs import Expert
@@ -104,9 +103,8 @@ def test_a_block_leaning_on_the_rim_is_no_success(make: Make) -> None:
     _, info = env.reset(seed=0, options=OPTIONS)
     bowl = position(info, 1)
     body = env.world.objects[0]
-    p.resetBasePositionAndOrientation(
-        body, bowl + np.array((0.045, 0, 0.10)), [0, 0, 0, 1], physicsClientId=env.world.client
-    )
+    beside = bowl + np.array((0.045, 0, 0.10))
+    env.world.bullet.resetBasePositionAndOrientation(body, beside, [0, 0, 0, 1])
     again = env._info()
     assert again["cliport_success"] and not again["is_success"]
 
