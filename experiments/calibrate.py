@@ -101,9 +101,8 @@ def main(args: Args) -> bool:
     with EpisodeFile(args.data) as episodes:
         if episodes.split != "val" or episodes.seeds is None:
             raise ValueError(f"calibration belongs to the val split, {args.data} holds {episodes.split!r}")
-        camera = PinholeCamera(
-            *(episodes.attribute(f"camera_{name}") for name in ("intrinsics", "extrinsics"))
-        )
+        views = (episodes.attribute(f"camera_{name}") for name in ("intrinsics", "extrinsics"))
+        camera = PinholeCamera(*views)
         for episode in track(episodes, "episodes", total=len(episodes), console=CONSOLE):
             if episode.success:
                 measured.add(episode, camera)
@@ -118,19 +117,17 @@ def report_success(measured: Measured) -> bool:
     limits, criterion, within = THRESHOLDS, SuccessCriterion(), float(measured.own[0].within_B)
     named = {"its own": measured.own, "another target of the scene": measured.other}
     passed, wrongly = (float(np.mean([bool(criterion(trace)) for trace in its])) for its in named.values())
-    rows = [
-        (name, str(len(its)), f"{share:.4f}", bar)
-        for (name, its), share, bar in zip(
-            named.items(), (passed, wrongly), (">= 0.99", "<= 0.01"), strict=True
-        )
-    ]
-    title = f"Success, judged with {limits} and at most {within:g} px to the target"
-    show(title, ("instruction", "episodes", "pass", "bar"), rows)
+    shares = (passed, ">= 0.99"), (wrongly, "<= 0.01")
+    show(
+        f"Success, judged with {limits} and at most {within:g} px to the target",
+        ("instruction", "episodes", "pass", "bar"),
+        [
+            (name, str(len(its)), f"{share:.4f}", bar)
+            for (name, its), (share, bar) in zip(named.items(), shares, strict=True)
+        ],
+    )
     found: dict[str, list[float]] = {}
-    for name, its in {
-        "things that are carried": measured.own,
-        "things that are not": measured.unmoved,
-    }.items():
+    for name, its in ("things that are carried", measured.own), ("things that are not", measured.unmoved):
         contacts = [float(trace.longest_contact(limits.contact_px)) for trace in its]
         found[f"frames in a row within {limits.contact_px:g} px: {name}"] = contacts
     for name, its in named.items():
@@ -149,12 +146,11 @@ def lying(trace: Trace) -> int:
 
 def report_looks(measured: Measured) -> bool:
     """Kinds and colours, told from the true masks."""
-    quantiles("Apparent width in m", {f"{kind}s": its for kind, its in measured.widths.items()}, digits=3)
-    widths, misnamed = (
-        {kind: np.array(its) for kind, its in measured.widths.items()},
-        measured.colors.count(False),
-    )
-    wrong = {kind: float(np.mean((its > BOWL_WIDTH) != (kind == "bowl"))) for kind, its in widths.items()}
+    widths, misnamed = measured.widths, measured.colors.count(False)
+    quantiles("Apparent width in m", {f"{kind}s": its for kind, its in widths.items()}, digits=3)
+    wrong = {
+        kind: float(np.mean((np.array(its) > BOWL_WIDTH) != (kind == "bowl"))) for kind, its in widths.items()
+    }
     shares = " and ".join(f"{share:.4f} of {kind}s" for kind, share in wrong.items())
     CONSOLE.print(f"at {BOWL_WIDTH} m, {shares} are taken for the other kind")
     CONSOLE.print(f"{misnamed} of {len(measured.colors)} colours are misnamed\n")
@@ -178,23 +174,23 @@ def report_precision(seeds: Sequence[int]) -> bool:
     starts_N2, picks_N2, ends_N2, places_N2 = (np.stack(column) for column in zip(*moved, strict=True))
 
     def errors(pick_height: float, place_height: float) -> list[Floats]:
-        """Distances on the table between where pixels point at a height, and true places: (N,) in metres each."""
+        """Distances on the table between where pixels point at a height, and true places: (N,) in mm each."""
         pointed = (picks_N2, starts_N2, pick_height), (places_N2, ends_N2, place_height)
         return [
-            np.linalg.norm(camera.unproject_to_plane(pixels_N2, height)[:, :2] - true_N2, axis=1)
+            1000 * np.linalg.norm(camera.unproject_to_plane(pixels_N2, height)[:, :2] - true_N2, axis=1)
             for pixels_N2, true_N2, height in pointed
         ]
 
     own = Controller(camera).pick_height, RELATIONS[relation].place_height
     heights = {f"{height:g}": (height, height) for height in HEIGHTS} | {f"ours: {own[0]:g}, {own[1]:g}": own}
     rows = [
-        (name, *(f"{f(its) * 1000:.1f}" for its in errors(*both) for f in (np.median, np.max)))
+        (name, *(f"{f(its):.1f}" for its in errors(*both) for f in (np.median, np.max)))
         for name, both in heights.items()
     ]
     columns = ("height (m)", "pick, median", "pick, largest", "place, median", "place, largest")
     show("Error of the thing's place on the table, in mm", columns, [*rows, ("bar", "", "< 10", "", "< 25")])
     pick, place = errors(*own)
-    return bool(pick.max() < 0.010 and place.max() < 0.025)
+    return bool(pick.max() < 10 and place.max() < 25)
 
 
 def place_and_centroid(info: dict[str, Any], thing: Thing) -> tuple[Floats, Floats]:
