@@ -83,7 +83,7 @@ class Factors:
         }
 
     def rearrange(self, rng: np.random.Generator, scene: Scene, sizes: Sizes, space: Box2) -> Scene:
-        """The scene with doubled colours, and blocks in bowls, on blocks and in the hand (within ``space``)."""
+        """The scene with doubled colours, and blocks in bowls, on blocks and (in ``space``) in the hand."""
         objects, streams = list(scene.objects), dict(zip(SHARES, rng.spawn(len(SHARES)), strict=True))
         chosen = {name for name, stream in streams.items() if stream.random() < getattr(self, name)}
         named = {index for pair in scene.goal for index in (pair.thing, pair.target)}

@@ -37,8 +37,8 @@ class Motion:
     descent_speed: (
         float  # in m/s; contact must fall well inside a frame, for blocks on the table and in bowls
     )
-    # Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down until
-    # something is touched. None: the tip moves softly along straight lines, for fixed times.
+    # Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down
+    # until something is touched. None: the tip moves softly along straight lines, for fixed times.
     joint_speed: float | None = None
 
 
