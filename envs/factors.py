@@ -54,7 +54,7 @@ class Factors:
     # Metres by which the camera and the point that it looks at move; 1 cm is about 2 pixels at 336x336.
     camera_shift: Range | None = (-0.02, 0.02)
     camera_zoom: Range | None = (-1.0, 1.0)  # degrees added to the field of view
-    same_color: float = 0.35  # share of the scenes in which things without a name may have one colour
+    same_color: float = 0.35  # share of the scenes in which things that are not named may share a colour
     in_bowl: float = 0.2  # share of the scenes in which another block starts in another bowl, if it can
     on_block: float = 0.2  # share of the scenes in which a block starts on one that is not named, if it can
     carried: float = 0.15  # share of the scenes in which the arm holds the first named block at the start

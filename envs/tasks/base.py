@@ -20,9 +20,7 @@ from envs.physics.simulation import Tabletop
 from envs.sampling import SceneRequest, sample_objects
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
-CLIPORT_RADIUS = (
-    0.05  # CLIPort calls it success when an object is this close to its place in the plane (metres)
-)
+CLIPORT_RADIUS = 0.05  # metres in the plane from its place within which CLIPort calls it success
 SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver
 
 
