@@ -26,11 +26,13 @@ class Args:
     """Scenes in each control mode; their seeds count from 0."""
     workers: int = 2
     """Processes."""
+    scene: str = "simple"
+    """Of the environments: simple, cliport or varied."""
 
 
-def play(control: str, seeds: range) -> list[bool]:
+def play(scene: str, control: str, seeds: range) -> list[bool]:
     """For each seed, whether the expert reaches the goal of its scene and the arm is home in the end."""
-    env = gym.make("PutBlockInBowl-v0", control=control)
+    env = gym.make("PutBlockInBowl-v0", scene=scene, control=control)
     results = []
     for seed in seeds:
         env.reset(seed=seed)
@@ -50,7 +52,7 @@ def main(args: Args) -> None:
     for control in ("primitive", "ee"):
         groups = [range(k, min(k + GROUP, args.episodes)) for k in range(0, args.episodes, GROUP)]
         run = Parallel(n_jobs=args.workers, return_as="generator")
-        jobs = (delayed(play)(control, seeds) for seeds in groups)
+        jobs = (delayed(play)(args.scene, control, seeds) for seeds in groups)
         results: list[bool] = []
         with tqdm(total=args.episodes, unit="episode", desc=control, leave=False) as progress:
             for group in run(jobs):

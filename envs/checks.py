@@ -17,7 +17,7 @@ def check_choice(name: str, value: Any, allowed: Iterable[Any], where: str = "",
 
 
 def check_range(name: str, value: Any, low: float, high: float | None, whole: bool = False) -> None:
-    """Raise ValueError unless ``value`` is a number (a ``whole`` one) of ``low`` to ``high``, both included."""
+    """Raise ValueError unless ``value`` is a (``whole``) number of ``low`` to ``high``, both included."""
     kinds = (int, np.integer) if whole else (int, float, np.number)
     numeric = isinstance(value, kinds) and not isinstance(value, bool)
     if not numeric or not low <= value <= (inf if high is None else high):

@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from envs.checks import check_range
 from envs.dataset import EpisodeConfig, collect, episode_count, record_episode
 from envs.factors import FACTORS
 from envs.geometry import SIZES
@@ -65,10 +66,8 @@ class Args:
     """Write a contact sheet PNG of the first episodes instead."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.episodes <= SEEDS_PER_SPLIT:
-            raise ValueError(f"--episodes must be 1 to {SEEDS_PER_SPLIT}, not {self.episodes}")
-        if self.workers < 1:
-            raise ValueError(f"--workers must be at least 1, not {self.workers}")
+        check_range("--episodes", self.episodes, 1, SEEDS_PER_SPLIT, whole=True)
+        check_range("--workers", self.workers, 1, None, whole=True)
 
 
 def main(args: Args) -> None:

@@ -22,22 +22,15 @@ COLORS: dict[str, RGB] = {
 }
 """Object colours, name -> RGB in 0..255 (the palette of CLIPort's tasks)."""
 
+# Colours that captions may name: of the train, val and test splits, and of the unseen-colour test (CLIPort's test
+# palette). Distractors may have any colour.
 SEEN: tuple[str, ...] = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
-"""Colours that captions of the train, val and test splits may name."""
-
 UNSEEN: tuple[str, ...] = ("blue", "green", "red", "pink", "purple", "white", "orange")
-"""Colours that captions of the unseen-colour test may name (CLIPort's test palette)."""
-
 CAPTION_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "unseen": UNSEEN, "all": tuple(COLORS)}
-"""Colour split -> the colours its captions may name. Distractors may have any colour."""
 
+# The colour of every link: a hue that no object has, so that "this pixel is my arm" never depends on the scene.
+# One colour for all, because the world model should see one thing, not six.
 ROBOT_RGB: RGB = (105, 72, 240)
-"""The one colour of every link and of the gripper.
-
-A robot knows how it looks, so the arm may carry a hue that no object has: then "this pixel is my arm" never
-depends on the scene. One colour for all links, because the world model should see one thing, not six.
-"""
-
 TABLE_RGB: RGB = (47, 47, 47)
 FLOOR_RGB: RGB = (239, 239, 239)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from functools import cache
@@ -79,9 +79,6 @@ class RecordedEpisode:
     arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
 
 
-_NAMES = ("id", "label", "kind", "color")  # what the file says of an object
-
-
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
     """Let the expert play episode number ``episode`` of the split in an environment of `EpisodeConfig.make`.
 
@@ -92,10 +89,11 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
     _, info = env.reset(seed=seed, options=split.options(seed))
     infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
     states = [each["frame_states"] for each in infos]
+    kept = ("id", "label", "kind", "color")
     return RecordedEpisode(
         seed=seed,
         instruction=info["instruction"],
-        objects=tuple({key: item[key] for key in _NAMES} for item in info["objects"]),
+        objects=tuple({key: item[key] for key in kept} for item in info["objects"]),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
         factors=info["factors"],
@@ -136,18 +134,8 @@ _COLUMNS: dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]] = {
 }
 
 
-def write_episodes(path: Path, config: EpisodeConfig, episodes: Sequence[RecordedEpisode]) -> None:
-    """Write a complete file; it appears under its name only when it is whole."""
-    with _atomically(path, path.parent) as part, h5py.File(part, "w") as file:
-        _create(file, config)
-        values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
-        for name, (dtype, value) in _COLUMNS.items():
-            values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
-        _append(file, values)
-
-
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
-    """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment, also after a kill."""
+    """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment."""
     with _atomically(path, workshop) as part:
         if path.exists():
             shutil.copyfile(path, part)
@@ -175,8 +163,7 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
     """Number of episodes in a file; 0 when there is none.
 
     Raises:
-        ValueError: when the file is not an episode file, is of another format version, or was collected with
-            another configuration.
+        ValueError: when the file is no episode file, or is of another format version or configuration.
     """
     if not path.exists():
         return 0
@@ -186,9 +173,8 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
             number = file.attrs.get("format_version")
             count = int(file["episode/length"].shape[0]) if kind == FORMAT else 0
     except (OSError, KeyError) as error:
-        raise ValueError(
-            f"{path} is not an episode file ({error}); move it away or choose another --out"
-        ) from error
+        hint = "move it away or choose another --out"
+        raise ValueError(f"{path} is not an episode file ({error}); {hint}") from error
     if kind != FORMAT:
         problem = "is an HDF5 file but not an episode file"
     elif number != FORMAT_VERSION:
@@ -206,20 +192,24 @@ def _create(file: h5py.File, config: EpisodeConfig) -> None:
     camera = Camera(setup.camera, config.image_size, setup.oversampling)
     for name, (shape, dtype, chunk, compression) in _ARRAYS.items():
         shape = tuple(config.image_size if n == SIDE else n for n in shape)
-        file.create_dataset(
-            name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(chunk, *shape), **compression
-        )
-    for name, dtype in [("start", "i8"), *((name, dtype) for name, (dtype, _) in _COLUMNS.items())]:
+        sizes = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (chunk, *shape)}
+        file.create_dataset(name, dtype=dtype, **sizes, **compression)
+    for name, (dtype, _) in {"start": ("i8", None), **_COLUMNS}.items():
         file.create_dataset(f"episode/{name}", (0,), dtype, maxshape=(None,), chunks=(1024,))
     versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
     ur5 = find_package()
-    file.attrs.update(format=FORMAT, format_version=FORMAT_VERSION)
-    file.attrs.update(split=split.name, first_seed=split.first_seed)
-    file.attrs["config"] = _config_json(config)
-    file.attrs["versions"] = json.dumps(versions | {PACKAGE: ur5.version if ur5 else None})
-    file.attrs["vocabulary"] = json.dumps(TASKS[split.task].vocabulary)
-    file.attrs["labels"] = json.dumps(LABELS)
-    file.attrs.update(camera_intrinsics=camera.intrinsics, camera_extrinsics=camera.extrinsics)
+    file.attrs.update(
+        format=FORMAT,
+        format_version=FORMAT_VERSION,
+        split=split.name,
+        first_seed=split.first_seed,
+        config=_config_json(config),
+        versions=json.dumps(versions | {PACKAGE: ur5.version if ur5 else None}),
+        vocabulary=json.dumps(TASKS[split.task].vocabulary),
+        labels=json.dumps(LABELS),
+        camera_intrinsics=camera.intrinsics,
+        camera_extrinsics=camera.extrinsics,
+    )
 
 
 def _append(file: h5py.File, values: dict[str, NDArray[Any]]) -> None:
@@ -287,4 +277,10 @@ def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path) ->
     if episode_count(piece, config) == stop - start:
         return
     env = _environment(config)
-    write_episodes(piece, config, [record_episode(env, config, number) for number in range(start, stop)])
+    episodes = [record_episode(env, config, number) for number in range(start, stop)]
+    values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
+    for name, (dtype, value) in _COLUMNS.items():
+        values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
+    with _atomically(piece, piece.parent) as part, h5py.File(part, "w") as file:
+        _create(file, config)
+        _append(file, values)

@@ -54,7 +54,7 @@ class Factors:
     # Metres by which the camera and the point that it looks at move; 1 cm is about 2 pixels at 336x336.
     camera_shift: Range | None = (-0.02, 0.02)
     camera_zoom: Range | None = (-1.0, 1.0)  # degrees added to the field of view
-    same_color: float = 0.35  # share of the scenes in which things without a name may have one colour
+    same_color: float = 0.35  # share of the scenes in which things that are not named may share a colour
     in_bowl: float = 0.2  # share of the scenes in which another block starts in another bowl, if it can
     on_block: float = 0.2  # share of the scenes in which a block starts on one that is not named, if it can
     carried: float = 0.15  # share of the scenes in which the arm holds the first named block at the start
@@ -83,7 +83,7 @@ class Factors:
         }
 
     def rearrange(self, rng: np.random.Generator, scene: Scene, sizes: Sizes, space: Box2) -> Scene:
-        """The scene with doubled colours, and blocks in bowls, on blocks and in the hand (within ``space``)."""
+        """The scene with doubled colours, and blocks in bowls, on blocks and (in ``space``) in the hand."""
         objects, streams = list(scene.objects), dict(zip(SHARES, rng.spawn(len(SHARES)), strict=True))
         chosen = {name for name, stream in streams.items() if stream.random() < getattr(self, name)}
         named = {index for pair in scene.goal for index in (pair.thing, pair.target)}

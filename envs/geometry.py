@@ -35,7 +35,7 @@ CLIPort's workspace is twice as wide. In a 64x64 image of that, a block would be
 that it fills the `close` camera with blocks of at least 7 pixels.
 """
 
-# Where the centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting arm.
+# Where centres of objects lie at the start: whole bowls stay in the `close` view, clear of the resting arm.
 SPAWN = Box2(x=(0.345, 0.705), y=(-0.16, 0.16))
 
 TABLE = Box2(x=(-0.2, 1.1), y=(-0.75, 0.75))  # the table top

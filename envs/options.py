@@ -48,7 +48,7 @@ class ResetOptions:
             scene = task.sample(rng, request, setup.sizes)
             scene = factors.rearrange(rng, scene, setup.sizes, setup.spawn.shrunk(CARRIED_MARGIN))
         else:
-            goal = self.goal or task.draw_goal(rng, layout, request.color_split, request.n_pairs)
+            goal = self.goal or task.draw_goal(rng, layout, request.color_split, len(request.named) // 2)
             scene = task.scene(layout, goal)
         joints = setup.arm.home_joints if isinstance(self.arm_start, str) else self.arm_start
         if self.arm_start == "random":
@@ -94,7 +94,7 @@ def read_options(
         missing = [kind for relation in task.relations for kind in relation.kinds if kind not in there]
         if missing:
             raise ValueError(f"a layout has at least one {missing[0]}")
-    request = _read_request(options, defaults, steps, layout is not None)
+    request = _read_request(options, defaults, steps if layout is None else None)
     goal = None
     if layout is not None and steps is not None:
         goal = task.find_goal(layout, steps)
@@ -111,22 +111,21 @@ def read_options(
 
 
 def _read_request(
-    options: Mapping[str, Any],
-    defaults: SceneRequest,
-    steps: tuple[Instruction, ...] | None,
-    has_layout: bool,
+    options: Mapping[str, Any], defaults: SceneRequest, steps: tuple[Instruction, ...] | None
 ) -> SceneRequest:
+    """What a random scene must be like, with what ``steps`` name."""
     given = {name: options[name] for name in RANDOM_SCENE_OPTIONS if name in options}
     check_choice("color_split", given.get("color_split", "all"), CAPTION_COLORS, form=str)
     for name in ("n_objects", "n_bowls", "blocks_in_bowls"):
         check_range(name, given.get(name, 0), 0, None, whole=True)
     if not isinstance(given.get("target_in_bowl", False), bool | np.bool_):
         raise ValueError(f"target_in_bowl must be True or False, not {given['target_in_bowl']!r}")
-    if steps is not None and not has_layout:
+    if steps is not None:
         named = [thing for step in steps for thing in step.things]
         if len({thing.color for thing in named}) < len(named):
             raise ValueError(
-                "no two objects of a random scene share a colour, so its instruction must not name a colour twice"
+                "no two objects of a random scene share a colour, so its instruction must not "
+                "name a colour twice"
             )
         given |= {"instructions": steps, "named": tuple(thing.kind for thing in named)}
     return replace(defaults, **given)

@@ -14,7 +14,6 @@ from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
 MAX_TRIES = 5000  # whole layouts, 0.3 ms each; the fullest scene needs about 100 (at most 516 in 60 seeds)
-
 ARM_JITTER = 0.08  # half-width in radians of the random joint offsets of a perturbed start pose
 
 
@@ -46,10 +45,6 @@ class SceneRequest:
             )
         if self.n_bowls is not None and not low <= self.n_bowls <= high:
             raise ValueError(f"n_bowls must be {low} to {high} for this scene; got {self.n_bowls}")
-
-    @property
-    def n_pairs(self) -> int:
-        return len(self.named) // 2
 
     @property
     def bowl_range(self) -> tuple[int, int]:

@@ -130,7 +130,11 @@ def _read_object(item: Any, workspace: Box2) -> ObjectSpec:
         place = np.asarray(item["xy"] if "xy" in item else item["position"], dtype=float).ravel()
         x, y = float(place[0]), float(place[1])
         height = float(place[2]) if len(place) > 2 and kind == "block" else None
-        yaw = _yaw(item["orientation"]) if "orientation" in item else float(item.get("yaw", 0.0))
+        if "orientation" not in item:
+            yaw = float(item.get("yaw", 0.0))
+        else:
+            qx, qy, qz, qw = map(float, item["orientation"])
+            yaw = float(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
     except (KeyError, TypeError, ValueError, IndexError):
         raise ValueError(f"the {color} {kind} needs a place 'xy' in metres, as in {_EXAMPLE}") from None
     if not (workspace.contains(x, y) and np.isfinite(yaw)):
@@ -138,13 +142,8 @@ def _read_object(item: Any, workspace: Box2) -> ObjectSpec:
     return ObjectSpec(str(kind), str(color), x, y, yaw, height=height)
 
 
-def _yaw(quaternion: Any) -> float:
-    x, y, z, w = (float(value) for value in quaternion)
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-
-
 def _find_supports(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
-    """Mark the blocks that lie in bowls, stand on blocks or hang at the arm, and refuse every other overlap."""
+    """Mark the blocks that lie in bowls, stand on blocks or hang at the arm, and refuse other overlaps."""
     placed: list[ObjectSpec] = []
     radius = inside_radius(sizes)
     for item in objects:

@@ -34,11 +34,9 @@ class Motion:
 
     pick_height: float  # height of the tip over the place to pick, before and after, in metres
     place_height: float
-    descent_speed: (
-        float  # in m/s; contact must fall well inside a frame, for blocks on the table and in bowls
-    )
-    # Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down until
-    # something is touched. None: the tip moves softly along straight lines, for fixed times.
+    descent_speed: float  # in m/s; contact must fall well inside a frame, on the table and in bowls
+    # Length of the joints' velocity, rad/s, constant along straight lines, as in CLIPort; the tip goes down
+    # until something is touched. None: the tip moves softly along straight lines, for fixed times.
     joint_speed: float | None = None
 
 
@@ -100,14 +98,12 @@ class Setup:
             bowl = max(drawn.get("bowl", 2 * sizes.bowl_radius), narrowest)
             sizes = sizes.resized(block, ceil(1000 * bowl) / 1000)
         view = np.array([self.camera.eye, self.camera.target]) + drawn.get("camera_shift", 0.0)
-        eye, target = map(tuple, view.tolist())
+        (eye, target), fov = map(tuple, view.tolist()), self.camera.fov + drawn.get("camera_zoom", 0.0)
         gains = drawn.get("object_gain", [1.0] * MAX_OBJECTS)
         tints = drawn.get("object_tint", [(0, 0, 0)] * MAX_OBJECTS)
         return replace(
             self,
-            camera=replace(
-                self.camera, eye=eye, target=target, fov=self.camera.fov + drawn.get("camera_zoom", 0.0)
-            ),
+            camera=replace(self.camera, eye=eye, target=target, fov=fov),
             arm=arm,
             light=light,
             sizes=sizes,

@@ -145,9 +145,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         else:
             self._box = ee_space(render_stride / physics_hz)
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
-        self.observation_space = observation_space(
-            image_size, setup.camera.far, self.task.longest_sentence, self.extras
-        )
+        longest = self.task.longest_sentence
+        self.observation_space = observation_space(image_size, setup.camera.far, longest, self.extras)
         self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.robot)
@@ -157,11 +156,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     @property
     def scene(self) -> Scene:
-        """The scene as it was built, for experts; `info` has what is true now.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
+        """The scene as it was built, for experts; gymnasium.error.ResetNeeded before the first reset."""
         if self._scene is None:
             raise gym.error.ResetNeeded("call reset() first")
         return self._scene
@@ -205,10 +200,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
                 # Rendering changes nothing in the world, so unwanted frames are not drawn.
                 if self.record_frames or self.render_mode == "human":
                     self._recorder.capture()
-            if not self._recorder.images:
-                self._recorder.capture()
         else:
             self._move(values)
+        if not self._recorder.images:
             self._recorder.capture()
         self._elapsed += 1
         after = self._fulfilled()

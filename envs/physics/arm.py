@@ -1,8 +1,7 @@
 """The robot arm: a UR5-like chain with UR5 link lengths, its URDF, and closed-form inverse kinematics.
 
-Joint convention (not UR's own signs): with all angles 0 the arm lies stretched along +x and the tool points
-down.
-Joints: pan about z, lift, elbow and wrist1 about y (positive lowers), wrist2 about x, wrist3 about z.
+With all angles 0 (not UR's own signs) the arm lies stretched along +x and the tool points down. Joints: pan about
+z, lift, elbow and wrist1 about y (positive lowers), wrist2 about x, wrist3 about z.
 """
 
 from __future__ import annotations
@@ -22,10 +21,9 @@ D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823
 SHOULDER_OFFSET, ELBOW_OFFSET = 0.13585, 0.1197
 TOOL = 0.10  # length of the plain arm's suction gripper below the flange
 TIP_RADIUS = 0.018  # radius of the suction cup
-FLANGE_RADIUS = 0.040
 
+# The suction gripper of a painted arm: radius, length, and height of the centre over the flange.
 GRIPPER = ((0.0382, 0.047, -0.0115), (0.0145, 0.055, -0.0625), (0.007, 0.02, -0.10))
-"""The suction gripper of a painted arm: radius, length, and height of the centre over the flange."""
 
 CUP_RGB: RGB = (55, 140, 215)
 FOOT_RGB: RGB = (218, 218, 218)
@@ -51,9 +49,8 @@ class Arm:
     """How an arm is built and where its tip may be, in metres."""
 
     home: Point  # where the tip rests
-    reach_low: Point
+    reach_low: Point  # the tip's commanded place stays within these corners, and within the arm's own reach
     reach_high: Point
-    """The tip's commanded place is kept within these corners, and within the arm's own reach."""
     tool: float = TOOL  # length of the suction gripper below the flange
     paint: Paint | None = None  # None: a plain arm of cylinders in `ROBOT_RGB`
 
@@ -68,15 +65,15 @@ class Arm:
             ValueError: when the point is out of the arm's reach.
         """
         x, y, z = position
-        reach = hypot(x, y)
+        reach, name = hypot(x, y), f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m"
         if reach <= D4:
-            raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is too close to the robot's base")
+            raise ValueError(f"{name} is too close to the robot's base")
         pan = atan2(y, x) - asin(D4 / reach)
         radial = sqrt(reach * reach - D4 * D4) - D5
         height = z + self.tool + D6 - D1
         distance = hypot(radial, height)
         if not abs(A2 - A3) < distance < A2 + A3 - 1e-3:
-            raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is out of the arm's reach")
+            raise ValueError(f"{name} is out of the arm's reach")
         at_shoulder = acos((A2 * A2 + distance * distance - A3 * A3) / (2 * A2 * distance))
         at_elbow = acos((A2 * A2 + A3 * A3 - distance * distance) / (2 * A2 * A3))
         lift = -atan2(height, radial) - at_shoulder
@@ -96,10 +93,8 @@ class Arm:
 
     def within_reach(self, point: Point) -> Point:
         """The nearest allowed place, found axis by axis; over far places the tip hangs lower."""
-        x, y, z = (
-            min(max(value, low), high)
-            for value, low, high in zip(point, self.reach_low, self.reach_high, strict=True)
-        )
+        bounds = zip(point, self.reach_low, self.reach_high, strict=True)
+        x, y, z = (min(max(value, low), high) for value, low, high in bounds)
         longest, drop = A2 + A3 - 2e-3, D6 + self.tool - D1
         lowest = self.reach_low[2] + drop
         furthest = hypot(sqrt(longest**2 - lowest**2) + D5, D4)
@@ -114,7 +109,7 @@ def arm_urdf(arm: Arm) -> str:
 
     A painted arm has the UR5's real shape if its package is installed, else cylinders.
     """
-    tool_z = -D6 - arm.tool
+    tool_z, flange = -D6 - arm.tool, D6 + 0.045
     looks = {
         "base": _cylinder(0.075, D1 + 0.05, (0, 0, D1 / 2 - 0.02)),
         "shoulder": _cylinder(0.06, SHOULDER_OFFSET + 0.06, (0, SHOULDER_OFFSET / 2, 0), along="y"),
@@ -122,33 +117,22 @@ def arm_urdf(arm: Arm) -> str:
         "forearm": _cylinder(0.045, A3, (A3 / 2, 0, 0), along="x"),
         "wrist1": _cylinder(0.04, 0.12, (0, 0, 0), along="y"),
         "wrist2": _cylinder(0.04, D5 + 0.04, (D5 / 2 + 0.01, 0, 0), along="x"),
-        "gripper": _cylinder(
-            FLANGE_RADIUS, D6 + 0.045, (0, 0, tool_z + arm.tool - 0.005 + (D6 + 0.045) / 2 - 0.04)
-        ),
+        "gripper": _cylinder(0.04, flange, (0, 0, tool_z + arm.tool - 0.005 + flange / 2 - 0.04)),
     }
-    links, joints = [], []
+    cup = ""
     if arm.paint is None:
         looks["gripper"] += _cylinder(0.027, arm.tool, (0, 0, tool_z + arm.tool / 2 + 0.003))
-        cup = ""
     else:
         for name, path in ur5_meshes().items():
             looks[name] = f'<visual><geometry><mesh filename="{path}"/></geometry></visual>'
         cup = _cylinder(0.0095, 0.016, (0, 0, 0.0025))
-        parts = [_cylinder(radius, length, (0, 0, z - D6)) for radius, length, z in GRIPPER]
-        links, joints = (
-            [_link("tool", 0.01, "".join(parts))],
-            [_joint("tool", "gripper", "tool", (0, 0, 0.0))],
-        )
     cup += (
         '<collision><origin xyz="0 0 0.005"/>'
         f'<geometry><cylinder radius="{TIP_RADIUS}" length="0.01"/></geometry></collision>'
     )
     masses = (2.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.2)
-    links = [
-        *(_link(name, mass, looks[name]) for name, mass in zip(looks, masses, strict=True)),
-        _link("tip", 0.01, cup),
-        *links,
-    ]
+    links = [_link(name, mass, looks[name]) for name, mass in zip(looks, masses, strict=True)]
+    links.append(_link("tip", 0.01, cup))
     joints = [
         _joint("pan", "base", "shoulder", (0, 0, D1), "0 0 1"),
         _joint("lift", "shoulder", "upper_arm", (0, SHOULDER_OFFSET, 0), "0 1 0"),
@@ -157,8 +141,11 @@ def arm_urdf(arm: Arm) -> str:
         _joint("wrist2", "wrist1", "wrist2", (0, 0, 0), "1 0 0"),
         _joint("wrist3", "wrist2", "gripper", (D5, 0, 0), "0 0 1"),
         _joint("tip", "gripper", "tip", (0, 0, tool_z)),
-        *joints,
     ]
+    if arm.paint is not None:
+        parts = [_cylinder(radius, length, (0, 0, z - D6)) for radius, length, z in GRIPPER]
+        links.append(_link("tool", 0.01, "".join(parts)))
+        joints.append(_joint("tool", "gripper", "tool", (0, 0, 0.0)))
     text = '<?xml version="1.0"?>\n<robot name="arm">\n' + "\n".join(links + joints) + "\n</robot>\n"
     return generated_file("arm", ".urdf", text)
 

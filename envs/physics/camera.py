@@ -48,9 +48,9 @@ class Camera:
     @property
     def intrinsics(self) -> NDArray[np.float64]:
         """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy."""
-        # PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured: masks
-        # sit half a pixel right and up of the projected bodies, at any image size), hence the shift. Of an even
-        # number of drawn pixels one has that corner at the centre of their average.
+        # PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured:
+        # masks sit half a pixel right and up of the projected bodies), hence the shift. Of an even number of
+        # drawn pixels one has that corner at the centre of their average.
         half, shift = self.size / 2, (self.oversampling % 2) / (2 * self.oversampling)
         fy = half / tan(radians(self.preset.fov) / 2)
         return np.array([[fy / self.preset.aspect, 0, half + shift], [0, fy, half - shift], [0, 0, 1]])

@@ -23,7 +23,6 @@ MAX_SPEED = 3.0  # fastest motion of the tip along an axis, in m/s
 MAX_TURN = 8.0  # fastest turn of the tip, in rad/s
 
 CLEAR = 0.06  # metres that the tip first rises straight up, out of a bowl, with joints at constant speed
-
 # Seconds. Nearly constant, whatever the distance: an episode of the default camera has about 25 frames.
 APPROACH, LIFT, CARRY, LOWER, RELEASE, RISE, RETURN = 4 / 15, 3 / 15, 5 / 15, 2 / 15, 1 / 15, 2 / 15, 4 / 15
 
@@ -33,9 +32,9 @@ def pick_and_place(
 ) -> Iterator[Action]:
     """The actions of one pick-and-place; each must be executed on ``robot`` before the next is drawn.
 
-    Places are in metres; ``turn`` is the yaw of the block from pick to place, radians. The motion goes on when
-    nothing was gripped: a wrong pick is a real failure, not an error. What already hangs over the place to pick
-    is only carried on.
+    Places are in metres; ``turn`` is the yaw of the block from pick to place, radians. The motion goes on
+    when nothing was gripped: a wrong pick is a real failure, not an error. What already hangs over the place
+    to pick is only carried on.
     """
     yaw, motion, grip_height = robot.yaw, robot.world.setup.motion, robot.world.sizes.block
     over_pick, over_place = (*pick, motion.pick_height), (*place, motion.place_height)
@@ -55,7 +54,7 @@ def pick_and_place(
 
 
 def _travel(robot: Robot, goal: Point, seconds: float, suction: bool, turn: float = 0.0) -> Iterator[Action]:
-    """Move to ``goal``, softly within ``seconds`` (if the speed limits let it), or with joints at constant speed."""
+    """Move to ``goal``, softly in ``seconds`` (more at the speed limits) or with joints at constant speed."""
     speed = robot.world.setup.motion.joint_speed
     way = _soft_way(robot, goal, seconds, turn) if speed is None else _joint_way(robot, goal, speed, turn)
     yaw = 0.0

@@ -42,7 +42,7 @@ class Recorder:
         self.states.append({name: value.astype(np.float32) for name, value in state.items()})
 
     def info(self) -> dict[str, Any]:
-        """All T frames: `frames` (T, H, W, 3), `frame_segmentations` (T, H, W), `frame_states` (dict of (T, ...))."""
+        """`frames` (T, H, W, 3), `frame_segmentations` (T, H, W), and `frame_states` with values (T, ...)."""
         names = self.states[0]
         return {
             "frames": np.stack([image.rgb for image in self.images]),

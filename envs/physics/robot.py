@@ -1,7 +1,4 @@
-"""The arm at work: it follows small tool motions, stops at contact, and sucks blocks.
-
-Both control modes of the environments run over this one controller, one camera frame at a time.
-"""
+"""The arm at work: one camera frame at a time it moves its tip, stops at contact, and sucks blocks."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ from envs.geometry import Sizes
 SEGMENTS = 24  # corners of the bowl's circle as seen
 ARC = 5  # bands of a round wall
 STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
-
 WALL_PARTS = 12  # convex parts of the bowl's wall as felt; a block's edge never meets their corners
 
 
@@ -31,7 +30,7 @@ class Mesh:
 
 @lru_cache(maxsize=16)
 def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
-    """The visible bowl, conical or ``rounded``: a lathed profile, smooth around, with an edge between bands."""
+    """The visible bowl, conical or ``rounded``: lathed, smooth around, with an edge between bands."""
     profile = _round_profile(sizes) if rounded else _bowl_profile(sizes)
     vertices: list[list[float]] = []
     normals: list[list[float]] = []
@@ -83,7 +82,7 @@ def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
 
 @lru_cache(maxsize=16)
 def bowl_contact_file(sizes: Sizes) -> str:
-    """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its wall."""
+    """Path of an OBJ file with one convex group for the bowl's floor and for each segment of its wall."""
     # A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
     # several parts; PyBullet turns each group of an OBJ file into one convex hull.
     lines: list[str] = []

@@ -51,11 +51,10 @@ class Bullet:
 
 
 class Tabletop:
-    """One PyBullet client with a table, the arm and the objects of a scene.
+    """One PyBullet client with a table, the arm and the objects of a scene."""
 
-    A rebuild after `resetSimulation` is bit-exact, whereas PyBullet's saveState/restoreState is not
-    (measured: up to 32 mm off), so `build` is the only way back to a state.
-    """
+    # A rebuild after `resetSimulation` is bit-exact, whereas PyBullet's saveState/restoreState is not (measured:
+    # up to 32 mm off), so `build` is the only way back to a state.
 
     def __init__(self, setup: Setup, image_size: int, physics_hz: int, gui: bool = False) -> None:
         self.image_size, self.physics_hz = image_size, physics_hz
@@ -209,7 +208,7 @@ def _rgba(rgb: RGB) -> list[float]:
 
 @lru_cache(maxsize=4)
 def _empty_table(camera: Camera, table: Box2, table_rgb: RGB, floor_rgb: RGB) -> Image:
-    """Table and floor without anything on them, as the camera sees them; its colours have a fourth channel."""
+    """Table and floor without anything on them, as the camera sees them; colours have a fourth channel."""
     # Drawing a surface that fills the view is most of a frame's cost at 336x336.
     size = camera.size
     v, u = np.mgrid[:size, :size] + 0.5

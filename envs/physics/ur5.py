@@ -11,19 +11,21 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
+from envs.geometry import Point
 from envs.physics.shapes import generated_file
 
 PACKAGE = "example-robot-data"
 FOLDER = "cmeel.prefix/share/example-robot-data/robots/ur_description/meshes/ur5/collision"
 
-CREASE = radians(40.0)
-"""Faces that meet at a larger angle keep an edge between them; others are shaded as one round surface."""
+CREASE = radians(
+    40.0
+)  # faces that meet at a larger angle keep an edge; others are shaded as one round surface
 
 _BACK = np.diag([-1.0, -1.0, 1.0])
 _ALONG = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 _DOWN = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Link of our arm -> mesh, its turn and its shift (metres) from the mesh's frame to the link's.
-_MESHES: dict[str, tuple[str, NDArray[np.float64], tuple[float, float, float]]] = {
+_MESHES: dict[str, tuple[str, NDArray[np.float64], Point]] = {
     "base": ("base", _BACK, (0, 0, 0)),
     "shoulder": ("shoulder", np.eye(3), (0, 0, 0)),
     "upper_arm": ("upperarm", _ALONG, (0, 0, 0)),

@@ -20,9 +20,7 @@ from envs.physics.simulation import Tabletop
 from envs.sampling import SceneRequest, sample_objects
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
-CLIPORT_RADIUS = (
-    0.05  # CLIPort calls it success when an object is this close to its place in the plane (metres)
-)
+CLIPORT_RADIUS = 0.05  # metres in the plane from its place within which CLIPort calls it success
 SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver
 
 
@@ -78,12 +76,6 @@ class Task:
     pairs: tuple[int, int] = (1, 1)  # fewest and most of a random goal; a given instruction has 1 to the most
 
     @property
-    def grammar(self) -> str:
-        """The form of the sentences, for messages."""
-        step = " | ".join(str(relation.between("<color>", "<color>")) for relation in self.relations)
-        return f"put {step} [and {step} ...]"
-
-    @property
     def vocabulary(self) -> tuple[str, ...]:
         """Every word that the sentences can contain, in a fixed order: the grammar's, then the colours."""
         words = " ".join(["put", *(str(relation.between("", "")) for relation in self.relations)]).split()
@@ -97,7 +89,7 @@ class Task:
         return max(len(self.format([r.between(color, color)] * self.pairs[1])) for r in self.relations)
 
     def format(self, instructions: Iterable[Instruction]) -> str:
-        """The sentence that asks for ``instructions``; ValueError for none, or a colour that does not exist."""
+        """The sentence that asks for ``instructions``; ValueError for none or for an unknown colour."""
         steps = list(instructions)
         if not steps:
             raise ValueError("a sentence needs at least one instruction")
@@ -113,7 +105,8 @@ class Task:
         Raises:
             ValueError: when the text is not of the grammar, names an unknown colour, or moves a thing twice.
         """
-        form = f"the form is: {self.grammar}"
+        known = " | ".join(str(relation.between("<color>", "<color>")) for relation in self.relations)
+        form = f"the form is: put {known} [and {known} ...]"
         if not isinstance(text, str):
             raise ValueError(f"an instruction is a string, not {type(text).__name__}; {form}")
         plain = " ".join(text.lower().rstrip(". ").split())

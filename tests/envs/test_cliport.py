@@ -69,7 +69,7 @@ def test_the_arm_rests_as_cliports_and_is_seen_whole(make: Make) -> None:
 
 
 def test_an_episode_has_about_50_frames_and_ends_as_it_began(make: Make) -> None:
-    env = make(scene="cliport", image_size=64, record_frames=True)
+    env = make(scene="cliport", image_size=16, record_frames=True)
     counts = []
     for seed in range(8):
         info, frames, joints = play(env, seed=seed)
@@ -128,7 +128,7 @@ def test_frames_are_means_of_larger_ones(make: Make) -> None:
 def test_a_primitive_moves_as_the_same_motion_in_ee_mode(make: Make, scene: str) -> None:
     for seed in range(2):
         shown = [
-            play(make(scene=scene, image_size=48, control=control, record_frames=True), seed=seed)[1]
+            play(make(scene=scene, image_size=32, control=control, record_frames=True), seed=seed)[1]
             for control in ("primitive", "ee")
         ]
         assert np.array_equal(*shown)

@@ -37,7 +37,7 @@ def play(
 @pytest.mark.parametrize("control", ["primitive", "ee"])
 def test_the_expert_succeeds(make: Make, control: str) -> None:
     """The claim of 99 % over 500 seeds is measured by benchmarks/expert.py; here, no failure in 20."""
-    env = make(control=control, record_frames=True)
+    env = make(control=control, image_size=16, record_frames=True)
     for seed in range(20):
         env.reset(seed=seed, options=STARTS[seed % len(STARTS)])
         reward, terminated, info, _ = play(env)
@@ -60,7 +60,8 @@ def test_a_primitive_moves_as_the_same_motion_in_ee_mode(make: Make, options: di
     ("stride", "hz", "scale"), [(8, 240, 1.0), (16, 480, 1.0), (16, 240, 0.7), (16, 240, 0.5), (5, 240, 1.0)]
 )
 def test_the_expert_succeeds_at_other_rates_and_sizes(make: Make, stride: int, hz: int, scale: float) -> None:
-    env = make(control="ee", render_stride=stride, physics_hz=hz, object_scale=scale, record_frames=True)
+    rates = {"render_stride": stride, "physics_hz": hz, "object_scale": scale}
+    env = make(control="ee", image_size=16, record_frames=True, **rates)
     for seed in range(2):
         env.reset(seed=seed, options={"blocks_in_bowls": 1})
         assert play(env)[2]["is_success"], seed
@@ -82,7 +83,7 @@ def test_an_episode_has_about_25_frames_and_ends_as_it_began(make: Make) -> None
 
 
 def test_the_expert_plays_every_instruction_of_a_scene(make: Make) -> None:
-    env = make(record_frames=True)
+    env = make(image_size=16, record_frames=True)
     _, start = env.reset(seed=9, options={"n_bowls": 3})
     colors = {kind: [o["color"] for o in start["objects"] if o["kind"] == kind] for kind in ("block", "bowl")}
     pairs = list(product(colors["block"], colors["bowl"]))
@@ -95,7 +96,7 @@ def test_the_expert_plays_every_instruction_of_a_scene(make: Make) -> None:
 
 
 def test_playing_another_instruction_does_not_reach_the_goal(make: Make) -> None:
-    env = make(record_frames=True)
+    env = make(image_size=16, record_frames=True)
     _, info = env.reset(seed=9, options={"n_bowls": 3})
     block, bowl = info["target"][0]
     other = next(o for o in info["objects"] if o["kind"] == "bowl" and o["id"] != bowl)
@@ -107,7 +108,7 @@ def test_playing_another_instruction_does_not_reach_the_goal(make: Make) -> None
 @pytest.mark.parametrize("n_pairs", [2, 3])
 @pytest.mark.parametrize("control", ["primitive", "ee"])
 def test_the_long_horizon_variant_rewards_each_pair(make: Make, n_pairs: int, control: str) -> None:
-    env = make("PutBlocksInBowls-v0", n_pairs=n_pairs, control=control, record_frames=True)
+    env = make("PutBlocksInBowls-v0", n_pairs=n_pairs, control=control, image_size=16, record_frames=True)
     for seed in range(3):
         observation, info = env.reset(seed=seed)
         assert observation["instruction"].count(" block in the ") == n_pairs
