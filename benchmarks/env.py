@@ -23,6 +23,7 @@ import tyro
 
 import envs
 from envs.dataset import EpisodeConfig, collect
+from envs.physics.ur5 import find_package
 from textocvp.data.episodes import EpisodeFile
 
 LINKS = 7
@@ -53,25 +54,38 @@ class Speed:
     """Building a scene."""
     episode_s: float
     """A whole expert episode: reset, and all its frames."""
-    frames: int
-    """Frames of an episode."""
+    frames: float
+    """Frames of an episode, on average."""
 
     def row(self) -> str:
         """A line of the table."""
         return (
             f"{self.name:<28}{self.frame_ms:>10.2f}{self.step_ms:>10.3f}{self.reset_ms:>10.1f}"
-            f"{self.episode_s:>12.2f}{self.frames:>8}"
+            f"{self.episode_s:>12.2f}{self.frames:>8.1f}"
         )
 
 
-def measure(name: str, size: int, hz: int, stride: int, episodes: int, meshes: Path | None = None) -> Speed:
+def measure(
+    name: str,
+    size: int,
+    hz: int,
+    stride: int,
+    episodes: int,
+    meshes: Path | None = None,
+    scene: str = "simple",
+) -> Speed:
     """Play expert episodes; with ``meshes``, next to the dense arm of that file."""
     env = gym.make(
-        "PutBlockInBowl-v0", image_size=size, physics_hz=hz, render_stride=stride, record_frames=True
+        "PutBlockInBowl-v0",
+        scene=scene,
+        image_size=size,
+        physics_hz=hz,
+        render_stride=stride,
+        record_frames=True,
     )
     world = env.unwrapped.world  # type: ignore[attr-defined]
     total = resets = 0.0
-    frames = 0
+    count = 0
     for seed in range(episodes + 1):
         begin = time.process_time()
         env.reset(seed=seed)
@@ -82,12 +96,13 @@ def measure(name: str, size: int, hz: int, stride: int, episodes: int, meshes: P
         for action in envs.Expert(env).actions():
             frames = 1 + len(env.step(action)[4]["frames"])
         if seed > 0:  # the first one fills caches
+            count += frames
             total += time.process_time() - begin + reset
             resets += reset
     render = _mean_ms(world.render, 30)
     step = _mean_ms(world.step, 200)
     env.close()
-    return Speed(name, render, step, 1e3 * resets / episodes, total / episodes, frames)
+    return Speed(name, render, step, 1e3 * resets / episodes, total / episodes, count / episodes)
 
 
 def _mean_ms(call: Any, times: int) -> float:
@@ -154,6 +169,16 @@ def main(args: Args) -> None:
                 f"  ours is {like.frame_ms / ours.frame_ms:.1f} times faster a frame and "
                 f"{like.episode_s / ours.episode_s:.1f} times an episode (bars: {bars})"
             )
+        for scene in ("cliport", "varied"):
+            for size in (168, 336):
+                speed = measure(f"{scene} {size}x{size}", size, 480, 16, args.episodes, scene=scene)
+                print(speed.row())
+                collecting = 1e3 * speed.episode_s / speed.frames
+                print(
+                    f"  {collecting:.1f} ms a frame of collection"
+                    + (" (bar: 25)" if size == 168 else "")
+                    + ("" if find_package() else ", with cylinders: the extra `ur5` is not installed")
+                )
         if args.reading:
             print(f"random clips of 6 frames: {clip_speed(folder):,.0f} frames/s (bar: 2,000)")
 

@@ -16,15 +16,24 @@ import tyro
 from numpy.typing import NDArray
 
 from envs.dataset import EpisodeConfig, collect, episode_count, record_episode
+from envs.factors import FACTORS
+from envs.geometry import SIZES
 from envs.physics.camera import PRESETS
+from envs.scenes import SCENES
 from envs.splits import SEEDS_PER_SPLIT, SPLITS
 
 if TYPE_CHECKING:
     SplitName = str
+    SceneName = str
     CameraName = str
+    SizesName = str
+    FactorName = str
 else:
     SplitName = tyro.extras.literal_type_from_choices(SPLITS)
+    SceneName = tyro.extras.literal_type_from_choices(SCENES)
     CameraName = tyro.extras.literal_type_from_choices(PRESETS)
+    SizesName = tyro.extras.literal_type_from_choices(SIZES)
+    FactorName = tyro.extras.literal_type_from_choices(FACTORS)
 
 COLUMNS = 9
 """Frames of an episode on a contact sheet."""
@@ -47,8 +56,14 @@ class Args:
     """The file to write. Default: data/tabletop-SPLIT.h5, or preview-SPLIT.png."""
     image_size: int = 64
     """Height and width in pixels."""
-    camera: CameraName = "close"
-    """Camera preset."""
+    scene: SceneName = "simple"
+    """Made easy, as CLIPort's, or CLIPort's with random factors."""
+    camera: CameraName | None = None
+    """Camera preset; by default the scene's."""
+    sizes: SizesName | None = None
+    """Of blocks and bowls: the paper's or CLIPort's own; by default the scene's."""
+    without: tuple[FactorName, ...] = ()
+    """Factors of the scene to leave out."""
     preview: bool = False
     """Write a contact sheet PNG of the first episodes instead."""
 
@@ -61,7 +76,8 @@ class Args:
 
 def main(args: Args) -> None:
     """Run the command line."""
-    config = EpisodeConfig(args.split, image_size=args.image_size, camera=args.camera)
+    factors = SCENES[args.scene].factors.without(args.without)
+    config = EpisodeConfig(args.split, args.scene, args.image_size, args.camera, args.sizes, factors=factors)
     if args.preview:
         out = args.out or Path(f"preview-{args.split}.png")
         save_contact_sheet(config, min(args.episodes, 8), out)

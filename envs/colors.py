@@ -42,6 +42,6 @@ TABLE_RGB: RGB = (47, 47, 47)
 FLOOR_RGB: RGB = (239, 239, 239)
 
 
-def palette() -> dict[str, Any]:
+def palette(robot: RGB = ROBOT_RGB, table: RGB = TABLE_RGB) -> dict[str, Any]:
     """How things look, RGB in 0..255: `colors` (name -> colour of an object), `robot` and `table`."""
-    return {"colors": dict(COLORS), "robot": ROBOT_RGB, "table": TABLE_RGB}
+    return {"colors": dict(COLORS), "robot": robot, "table": table}

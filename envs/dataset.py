@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,9 +20,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from envs.expert import Expert
-from envs.physics.camera import PRESETS, Camera
+from envs.factors import Factors
+from envs.physics.camera import Camera
 from envs.physics.simulation import LABELS
+from envs.physics.ur5 import PACKAGE, find_package
 from envs.scene import MAX_OBJECTS
+from envs.scenes import Setup, make_setup
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks import TASKS, Question
@@ -47,16 +50,25 @@ class EpisodeConfig:
     """What, beside the seed, decides the content of an episode."""
 
     split: str
+    scene: str = "simple"
     image_size: int = 64
-    camera: str = "close"
+    camera: str | None = None
+    """None, as for the next two and the factors: the scene's own."""
+    sizes: str | None = None
+    physics_hz: int | None = None
+    factors: Factors | None = None
     object_scale: float = 1.0
     render_stride: int = 16
-    physics_hz: int = 240
 
     def make(self) -> TabletopEnv:
         """The environment that plays such episodes."""
-        arguments = asdict(self)
+        arguments = {field.name: getattr(self, field.name) for field in fields(self)}
         return TabletopEnv(SPLITS[arguments.pop("split")].task, record_frames=True, **arguments)
+
+    @property
+    def setup(self) -> Setup:
+        """What is alike in all scenes."""
+        return make_setup(self.scene, self.camera, self.sizes, self.factors, self.object_scale)
 
 
 @dataclass(frozen=True)
@@ -69,6 +81,8 @@ class RecordedEpisode:
     """By id; each with `id`, `label`, `kind` and `color`."""
     questions: tuple[Question, ...]
     success: bool
+    factors: dict[str, Any]
+    """Values of this scene's factors."""
     arrays: dict[str, NDArray[Any]]
     """The arrays over frames (T, ...), named as in the file, without padding for objects."""
 
@@ -93,6 +107,7 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
         ),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
+        factors=info["factors"],
         arrays={
             "frames": np.concatenate([each["frames"] for each in infos]),
             "segmentation": np.concatenate([each["frame_segmentations"] for each in infos]),
@@ -125,6 +140,7 @@ _INDEX: dict[str, Any] = {
     "instruction": h5py.string_dtype(),
     "objects": h5py.string_dtype(),
     "questions": h5py.string_dtype(),
+    "factors": h5py.string_dtype(),
     "success": "?",
 }
 
@@ -204,7 +220,8 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
 
 def _create(file: h5py.File, config: EpisodeConfig) -> None:
     """Make all datasets, empty, and all attributes."""
-    split, camera = SPLITS[config.split], Camera(PRESETS[config.camera], config.image_size)
+    split, setup = SPLITS[config.split], config.setup
+    camera = Camera(setup.camera, config.image_size, setup.oversampling)
     for name, (shape, dtype, chunk, compression) in _ARRAYS.items():
         shape = tuple(config.image_size if n == SIDE else n for n in shape)
         file.create_dataset(
@@ -212,13 +229,14 @@ def _create(file: h5py.File, config: EpisodeConfig) -> None:
         )
     for name, dtype in _INDEX.items():
         file.create_dataset(f"episode/{name}", (0,), dtype, maxshape=(None,), chunks=(1024,))
-    packages = ("pybullet", "gymnasium", "numpy", "h5py")
+    versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
+    ur5 = find_package()
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["split"] = split.name
     file.attrs["first_seed"] = split.first_seed
     file.attrs["config"] = _config_json(config)
-    file.attrs["versions"] = json.dumps({name: version(name) for name in packages})
+    file.attrs["versions"] = json.dumps(versions | {PACKAGE: ur5.version if ur5 else None})
     file.attrs["vocabulary"] = json.dumps(TASKS[split.task].vocabulary)
     file.attrs["labels"] = json.dumps(LABELS)
     file.attrs["camera_intrinsics"] = camera.intrinsics
@@ -261,12 +279,13 @@ def _index(episodes: Sequence[RecordedEpisode]) -> dict[str, NDArray[Any]]:
         "instruction": column(lambda e: e.instruction, object),
         "objects": column(lambda e: json.dumps(e.objects), object),
         "questions": column(lambda e: json.dumps([q._asdict() for q in e.questions]), object),
+        "factors": column(lambda e: json.dumps(e.factors), object),
         "success": column(lambda e: e.success),
     }
 
 
 def _config_json(config: EpisodeConfig) -> str:
-    return json.dumps(asdict(config))
+    return json.dumps(asdict(config) | {"factors": asdict(config.setup.factors)})
 
 
 # -- Many processes, one file ------------------------------------------------------------------------------

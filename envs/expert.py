@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.geometry import WORKSPACE
 from envs.physics.motion import pick_and_place
 from envs.scene import GoalPair
 from envs.tabletop import TabletopEnv
@@ -52,8 +51,9 @@ class Expert:
         place = self._env.task.relation(pair).place(world, pair)
         values = np.array([*world.pose(pair.thing)[0][:2], *place], dtype=np.float32)
         # Things can be pushed out of the workspace, where no action may point.
-        low = np.array([WORKSPACE.x[0], WORKSPACE.y[0]] * 2, dtype=np.float32)
-        high = np.array([WORKSPACE.x[1], WORKSPACE.y[1]] * 2, dtype=np.float32)
+        space = world.setup.workspace
+        low = np.array([space.x[0], space.y[0]] * 2, dtype=np.float32)
+        high = np.array([space.x[1], space.y[1]] * 2, dtype=np.float32)
         return np.clip(values, low, high)
 
     def _play(self, goal: tuple[GoalPair, ...]) -> Iterator[NDArray[np.float32]]:

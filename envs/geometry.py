@@ -5,7 +5,7 @@ World frame: metres, z up, the table top is z = 0, the robot stands at the origi
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,10 @@ class Box2:
 
     def contains(self, x: float, y: float) -> bool:
         return self.x[0] <= x <= self.x[1] and self.y[0] <= y <= self.y[1]
+
+    def shrunk(self, margin: float) -> Box2:
+        """The part of it that is at least ``margin`` away from its edge."""
+        return Box2((self.x[0] + margin, self.x[1] - margin), (self.y[0] + margin, self.y[1] - margin))
 
     def __str__(self) -> str:
         return f"x in [{self.x[0]}, {self.x[1]}], y in [{self.y[0]}, {self.y[1]}] (metres)"
@@ -67,6 +71,15 @@ class Sizes:
         """All of them times ``factor``."""
         return Sizes(**{name: value * factor for name, value in asdict(self).items()})
 
+    def resized(self, block: float, bowl: float) -> Sizes:
+        """Blocks of edge ``block``, and bowls of diameter ``bowl`` in the same proportions."""
+        scaled = self.scaled(bowl / (2 * self.bowl_radius))
+        return replace(scaled, block=block)
+
     def footprint(self, kind: str) -> float:
         """Radius in metres of the smallest upright cylinder around an object."""
         return self.bowl_radius if kind == "bowl" else self.block * 0.5**0.5
+
+
+SIZES: dict[str, Sizes] = {"paper": Sizes(), "cliport": Sizes().resized(block=0.04, bowl=0.114)}
+"""As in the paper's published frames, and as in CLIPort itself."""

@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 
 from envs.colors import CAPTION_COLORS
-from envs.geometry import Sizes
-from envs.physics.arm import Joints, forward_kinematics
-from envs.physics.robot import HOME_JOINTS, REACH_HIGH, REACH_LOW
+from envs.factors import read_factors
+from envs.physics.arm import Arm, Joints
 from envs.sampling import SceneRequest, arm_jitter
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, read_layout
+from envs.scenes import Setup
 from envs.tasks.base import Task
 
+CARRIED_MARGIN = 0.1
+"""A block that is carried at the start is this far inside the spawn area, so that the arm reaches it."""
+
 RANDOM_SCENE_OPTIONS = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
-OPTIONS = ("layout", "instruction", "arm_start", *RANDOM_SCENE_OPTIONS)
+OPTIONS = ("layout", "instruction", "arm_start", "factors", *RANDOM_SCENE_OPTIONS)
 
 
 @dataclass(frozen=True)
@@ -30,24 +33,37 @@ class ResetOptions:
     """What the instruction asks for, where layout and instruction are both given."""
     arm_start: str | Joints
     request: SceneRequest
+    setup: Setup
+    factors: dict[str, Any] | None
+    """Values to use instead of random ones."""
 
-    def draw(self, rng: np.random.Generator, sizes: Sizes) -> tuple[Scene, Joints]:
-        """The scene to build, and the joint angles the arm starts at."""
+    def draw(self, rng: np.random.Generator) -> tuple[Setup, dict[str, Any], Scene, Joints]:
+        """What to build: the setup, the values of its factors, the scene, and the arm's joint angles."""
         task, layout, request = self.task, self.layout, self.request
+        factors = self.setup.factors
+        drawn = factors.draw(rng) if self.factors is None else self.factors
+        if layout is not None and self.factors is None:  # the layout was checked with the usual sizes
+            drawn = {name: value for name, value in drawn.items() if name not in ("block", "bowl")}
+        setup = self.setup.with_factors(drawn)
         if layout is None:
-            scene = task.sample(rng, request, sizes)
+            scene = task.sample(rng, request, setup.sizes)
+            scene = factors.rearrange(rng, scene, setup.sizes, setup.spawn.shrunk(CARRIED_MARGIN))
         else:
             scene = task.scene(
                 layout, self.goal or task.draw_goal(rng, layout, request.color_split, request.n_pairs)
             )
-        start = HOME_JOINTS if isinstance(self.arm_start, str) else self.arm_start
+        start = setup.arm.home_joints if isinstance(self.arm_start, str) else self.arm_start
         offsets = arm_jitter(rng) if self.arm_start == "random" else (0.0,) * 6
         joints = tuple(angle + offset for angle, offset in zip(start, offsets, strict=True))
-        return scene, joints  # type: ignore[return-value]
+        if scene.held >= 0:
+            item = scene.objects[scene.held]
+            tip = (item.x, item.y, (item.height or 0.0) + setup.sizes.block / 2)
+            joints = setup.arm.inverse(tip, 0.0)
+        return setup, drawn, scene, joints  # type: ignore[return-value]
 
 
 def read_options(
-    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, sizes: Sizes
+    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, setup: Setup
 ) -> ResetOptions:
     """Check `options`; what is not given comes from ``defaults``.
 
@@ -63,7 +79,15 @@ def read_options(
         raise ValueError(
             f"unknown reset option {', '.join(map(repr, unknown))}; allowed: {', '.join(OPTIONS)}"
         )
-    layout = read_layout(options["layout"], sizes) if options.get("layout") is not None else None
+    factors = read_factors(options["factors"]) if options.get("factors") is not None else None
+    layout = None
+    if options.get("layout") is not None:
+        sizes = setup.with_factors(factors or {}).sizes
+        layout = read_layout(options["layout"], sizes, setup.workspace, setup.crowded)
+        for item in layout:
+            tip = (item.x, item.y, (item.height or 0.0) + sizes.block / 2)
+            if item.height is not None and setup.arm.within_reach(tip) != tip:
+                raise ValueError(f"the arm cannot hold the {item.thing} at {tip[:2]}, {item.height} m high")
     steps = task.parse(options["instruction"]) if options.get("instruction") is not None else None
     if layout is not None:
         clash = [name for name in RANDOM_SCENE_OPTIONS if name in options and name != "color_split"]
@@ -85,7 +109,8 @@ def read_options(
             f"has anything to do in this layout; give an 'instruction', or another 'color_split'"
         )
     task.check_instructions(steps or ())
-    return ResetOptions(task, layout, goal, _read_arm_start(options.get("arm_start", "home")), request)
+    arm_start = _read_arm_start(options.get("arm_start", "home"), setup.arm)
+    return ResetOptions(task, layout, goal, arm_start, request, setup, factors)
 
 
 def _read_request(
@@ -119,7 +144,7 @@ def _read_request(
     return replace(defaults, **given)
 
 
-def _read_arm_start(value: Any) -> str | Joints:
+def _read_arm_start(value: Any, arm: Arm) -> str | Joints:
     if isinstance(value, str):
         if value in ("home", "random"):
             return value
@@ -130,13 +155,13 @@ def _read_arm_start(value: Any) -> str | Joints:
             angles = np.empty(0)
         if angles.shape == (6,) and np.isfinite(angles).all():
             joints: Joints = tuple(angles.tolist())
-            tip, _ = forward_kinematics(joints)
+            tip, _ = arm.forward(joints)
             upright = abs(sum(joints[1:4])) < 1e-3 and abs(joints[4]) < 1e-3
-            within = all(low <= at <= high for low, at, high in zip(REACH_LOW, tip, REACH_HIGH, strict=True))
+            within = max(map(abs, np.subtract(arm.within_reach(tip), tip))) < 1e-9
             if upright and within:
                 return joints
     raise ValueError(
         f"arm_start must be 'home', 'random' or 6 finite joint angles in radians with the tool upright "
-        f"(lift + elbow + wrist1 = 0, wrist2 = 0) and its tip between {REACH_LOW} and {REACH_HIGH} m; "
+        f"(lift + elbow + wrist1 = 0, wrist2 = 0) and its tip between {arm.reach_low} and {arm.reach_high} m; "
         f"got {value!r}"
     )

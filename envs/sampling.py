@@ -9,7 +9,7 @@ from math import hypot, pi
 import numpy as np
 
 from envs.colors import COLORS, ColorSplit
-from envs.geometry import SPAWN, Sizes
+from envs.geometry import SPAWN, Box2, Sizes
 from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
@@ -41,6 +41,10 @@ class SceneRequest:
     """How many blocks that the instruction does not name start in bowls that it does not name."""
     target_in_bowl: bool = False
     """Whether the first named block starts in a bowl that is not named."""
+    spawn: Box2 = SPAWN
+    """Where objects stand."""
+    edge: float = 0.0
+    """How far from the edge of that area their centres are, in footprints."""
 
     def __post_init__(self) -> None:
         if not len(self.named) <= self.n_objects <= MAX_OBJECTS:
@@ -94,7 +98,7 @@ def sample_objects(
     # Ids carry no meaning: without the shuffle the target would always be object 0.
     things = [things[k] for k in rng.permutation(len(things))]
     insides = _draw_insides(rng, request, things, named)
-    places = _draw_places(rng, [thing.kind for thing in things], insides, sizes)
+    places = _draw_places(rng, request, [thing.kind for thing in things], insides, sizes)
     return tuple(
         ObjectSpec(thing.kind, thing.color, x, y, float(rng.uniform(-pi, pi)), insides.get(index))
         for index, (thing, (x, y)) in enumerate(zip(things, places, strict=True))
@@ -121,14 +125,14 @@ def _draw_insides(
 
 
 def _draw_places(
-    rng: np.random.Generator, kinds: list[str], insides: dict[int, int], sizes: Sizes
+    rng: np.random.Generator, request: SceneRequest, kinds: list[str], insides: dict[int, int], sizes: Sizes
 ) -> list[tuple[float, float]]:
     """Places such that no object touches or much hides another."""
     standing = [index for index in range(len(kinds)) if index not in insides]
     # Wide things first: a late bowl would find only gaps that fit a block.
     standing.sort(key=lambda index: -sizes.footprint(kinds[index]))
     for _ in range(MAX_TRIES):
-        places = _try_places(rng, kinds, standing, sizes)
+        places = _try_places(rng, request, kinds, standing, sizes)
         if places is not None:
             break
     else:
@@ -144,11 +148,12 @@ def _draw_places(
 
 
 def _try_places(
-    rng: np.random.Generator, kinds: list[str], standing: list[int], sizes: Sizes
+    rng: np.random.Generator, request: SceneRequest, kinds: list[str], standing: list[int], sizes: Sizes
 ) -> dict[int, tuple[float, float]] | None:
     places: dict[int, tuple[float, float]] = {}
     for index in standing:
-        for x, y in rng.uniform((SPAWN.x[0], SPAWN.y[0]), (SPAWN.x[1], SPAWN.y[1]), size=(40, 2)).tolist():
+        area = request.spawn.shrunk(request.edge * sizes.footprint(kinds[index]))
+        for x, y in rng.uniform((area.x[0], area.y[0]), (area.x[1], area.y[1]), size=(40, 2)).tolist():
             if all(_apart(x - a, y - b, kinds[index], kinds[k], sizes) for k, (a, b) in places.items()):
                 places[index] = (x, y)
                 break

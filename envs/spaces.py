@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.geometry import WORKSPACE
+from envs.geometry import Box2
 from envs.physics.motion import MAX_SPEED, MAX_TURN
 
 EXTRAS = ("depth", "segmentation", "proprio")
@@ -23,10 +23,10 @@ EE_NAMES = ("dx", "dy", "dz", "dyaw", "suction")
 PRIMITIVE_NAMES = ("pick_x", "pick_y", "place_x", "place_y", "yaw")
 
 
-def primitive_space(place_yaw: bool) -> spaces.Box:
+def primitive_space(workspace: Box2, place_yaw: bool) -> spaces.Box:
     """`[pick_x, pick_y, place_x, place_y]` in metres of the world frame, and with ``place_yaw`` radians."""
-    low = [WORKSPACE.x[0], WORKSPACE.y[0]] * 2 + [-pi] * place_yaw
-    high = [WORKSPACE.x[1], WORKSPACE.y[1]] * 2 + [pi] * place_yaw
+    low = [workspace.x[0], workspace.y[0]] * 2 + [-pi] * place_yaw
+    high = [workspace.x[1], workspace.y[1]] * 2 + [pi] * place_yaw
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
 from math import dist
 from typing import Any, Literal, SupportsFloat
 
@@ -11,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.checks import check_choice, check_range
-from envs.colors import palette
-from envs.geometry import Sizes
+from envs.factors import Factors
 from envs.options import read_options
-from envs.physics.camera import PRESETS, Camera
 from envs.physics.motion import Action, pick_and_place
 from envs.physics.recorder import Recorder
-from envs.physics.robot import HOME, Robot
+from envs.physics.robot import Robot
 from envs.physics.simulation import FIRST_OBJECT, Tabletop
 from envs.scene import Scene
+from envs.scenes import make_setup
 from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
 from envs.tasks import TASKS, Task
 
@@ -65,8 +66,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     color, position and orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`,
     `table`), `camera` (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the
     centre of the top-left pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1),
-    `sim_step`. With ``record_frames=True`` also `frames` (T, H, W, 3), `frame_segmentations` (T, H, W) and
-    `frame_states`: the frames of this step, or the one of `reset`.
+    `factors` (their values in this scene, see `envs.factors.Factors`), `sim_step`. With
+    ``record_frames=True`` also `frames` (T, H, W, 3), `frame_segmentations` (T, H, W) and `frame_states`:
+    the frames of this step, or the one of `reset`.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -75,18 +77,24 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     `instruction`; `layout`: a list of objects such as ``{"kind": "block", "color": "red", "xy": (0.5, 0.1)}``
     (``info["objects"]`` of an earlier reset is one too); or a random scene with `n_objects`, `n_bowls`,
     `color_split` ("seen", "unseen", "all"), `blocks_in_bowls` (how many other blocks start in bowls) and
-    `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles.
+    `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles; `factors`: values of an earlier
+    ``info["factors"]`` instead of random ones. Layout and factors together show the same scene again.
 
     Args:
+        scene: "simple" (made easy), "cliport" (CLIPort's table, robot, grays, light and speed, in the paper's
+            view) or "varied" (the same with random factors).
         task: a name of `envs.tasks.TASKS`, or a task of your own.
         n_pairs: how many pairs a random goal has; by default the task's fewest. An instruction in `reset`'s
             options may name from 1 to the task's most.
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
-        camera: "close" (the workspace fills the frame) or "paper" (the camera of the paper's frames).
+        camera: "close" (a narrow workspace fills the frame) or "paper" (the camera of the paper's frames); by
+            default the scene's own.
+        sizes: "paper" (blocks of 5.8 cm, bowls of 14 cm) or "cliport" (4 cm, 11.4 cm); by default the scene's.
+        factors: ranges of what varies from scene to scene; by default the scene's.
         object_scale: scales blocks and bowls, 0.5 to 1; at 1 they are the paper's, and 8 of them just fit.
         render_stride: physics steps between two camera frames.
-        physics_hz: physics steps per second.
+        physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
         max_steps: steps until truncation; by default 3 primitives or 75 frames for each goal pair.
         extras: further observations, of "depth", "segmentation", "proprio".
         place_yaw: whether a primitive has a fifth value.
@@ -106,15 +114,18 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         n_pairs: int | None = None,
         control: Literal["primitive", "ee"] = "primitive",
         image_size: int = 64,
-        camera: str = "close",
+        camera: str | None = None,
         object_scale: float = 1.0,
         render_stride: int = 16,
-        physics_hz: int = 240,
+        physics_hz: int | None = None,
         max_steps: int | None = None,
         extras: Sequence[str] = (),
         place_yaw: bool = False,
         record_frames: bool = False,
         render_mode: str | None = None,
+        scene: str = "simple",
+        sizes: str | None = None,
+        factors: Factors | None = None,
     ) -> None:
         if isinstance(task, str):
             check_choice("task", task, TASKS)
@@ -122,12 +133,12 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.n_pairs = self.task.pairs[0] if n_pairs is None else n_pairs
         check_range("n_pairs", self.n_pairs, *self.task.pairs, whole=True)
         check_choice("control", control, ("primitive", "ee"))
-        check_choice("camera", camera, PRESETS)
+        self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         for extra in extras:
             check_choice("extras", extra, EXTRAS)
         check_range("image_size", image_size, 16, 2048, whole=True)
-        check_range("object_scale", object_scale, 0.5, 1.0)
+        physics_hz = setup.physics_hz if physics_hz is None else physics_hz
         check_range("physics_hz", physics_hz, 120, 2000, whole=True)
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
         if max_steps is not None:
@@ -137,19 +148,19 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         per_pair = 3 if control == "primitive" else round(EE_SECONDS * physics_hz / render_stride)
         self.max_steps = max_steps or per_pair * self.n_pairs
         self.metadata = self.metadata | {"render_fps": max(1, round(physics_hz / render_stride))}
-        self.camera = Camera(PRESETS[camera], image_size)
         primitive = control == "primitive"
-        self._box = primitive_space(place_yaw) if primitive else ee_space(render_stride / physics_hz)
+        self._box = (
+            primitive_space(setup.workspace, place_yaw) if primitive else ee_space(render_stride / physics_hz)
+        )
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
         self.observation_space = observation_space(
-            image_size, self.camera.preset.far, self.task.longest_sentence, self.extras
+            image_size, setup.camera.far, self.task.longest_sentence, self.extras
         )
-        self.world = Tabletop(
-            self.camera, Sizes().scaled(object_scale), physics_hz, gui=render_mode == "human"
-        )
+        self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.world, self.robot)
         self._scene: Scene | None = None
+        self._drawn: dict[str, Any] = {}
         self._elapsed = 0
 
     @property
@@ -171,11 +182,13 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: for options that are not allowed, before anything changes.
         """
-        checked = read_options(options, self.task, self.task.request(self.n_pairs), self.world.sizes)
+        setup = self.setup
+        request = replace(self.task.request(self.n_pairs), spawn=setup.spawn, edge=setup.edge)
+        checked = read_options(options, self.task, request, setup)
         super().reset(seed=seed)
-        scene, joints = checked.draw(self.np_random, self.world.sizes)
-        self.world.build(scene, joints)
-        self.robot.reset(joints)
+        setup, self._drawn, scene, joints = checked.draw(self.np_random)
+        self.world.build(setup, scene, joints)
+        self.robot.reset(joints, scene.held)
         self.robot.hold_still(MAX_SETTLE_STEPS)
         self._scene, self._elapsed = scene, 0
         self._recorder.restart()
@@ -231,7 +244,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         return [self.task.relation(pair).fulfilled(self.world, self.robot, pair) for pair in self.scene.goal]
 
     def _is_home(self) -> bool:
-        return dist(self.robot.state().position, HOME) < HOME_TOLERANCE
+        return dist(self.robot.state().position, self.robot.arm.home) < HOME_TOLERANCE
 
     def _observe(self) -> Observation:
         image, observation = self._recorder.images[-1], {}
@@ -255,10 +268,11 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "target": np.array([(pair.thing, pair.target) for pair in goal]),
             "objects": self._object_infos(),
             "segmentation": self._recorder.images[-1].segmentation.copy(),
-            "palette": palette(),
-            "camera": {"intrinsics": self.camera.intrinsics, "extrinsics": self.camera.extrinsics},
+            "palette": world.setup.palette,
+            "camera": {"intrinsics": world.camera.intrinsics, "extrinsics": world.camera.extrinsics},
             "gripper": {"position": np.array(grip.position), "yaw": grip.yaw, "holding": grip.holding},
             "sim_step": world.steps,
+            "factors": deepcopy(self._drawn),
         }
         if self.record_frames:
             info |= self._recorder.info()

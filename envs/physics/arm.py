@@ -7,10 +7,12 @@ Joints: pan about z, lift, elbow and wrist1 about y (positive lowers), wrist2 ab
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 
-from envs.colors import ROBOT_RGB
+from envs.colors import RGB, ROBOT_RGB
 from envs.physics.shapes import generated_file
+from envs.physics.ur5 import ur5_meshes
 
 Joints = tuple[float, float, float, float, float, float]
 Point = tuple[float, float, float]
@@ -20,74 +22,134 @@ D1, A2, A3, D4, D5, D6 = 0.089159, 0.425, 0.39225, 0.10915, 0.09465, 0.0823
 SHOULDER_OFFSET, ELBOW_OFFSET = 0.13585, 0.1197
 
 TOOL = 0.10
-"""Length of the suction gripper below the flange."""
+"""Length of the plain arm's suction gripper below the flange."""
 
 TIP_RADIUS = 0.018
 """Radius of the suction cup."""
 
 FLANGE_RADIUS = 0.040
 
+GRIPPER = ((0.0382, 0.047, -0.0115), (0.0145, 0.055, -0.0625), (0.007, 0.02, -0.10))
+"""The suction gripper of a painted arm: radius, length, and height of the centre over the flange."""
+
+CUP_RGB: RGB = (55, 140, 215)
+FOOT_RGB: RGB = (218, 218, 218)
+
 TIP_LINK = 6
 """Index of the link that carries the suction cup; its frame is the tip itself."""
 
 
-def inverse_kinematics(position: Point, yaw: float) -> Joints:
-    """Joint angles (radians, elbow up) that hold the tip at ``position`` (metres), pointing straight down.
+@dataclass(frozen=True)
+class Paint:
+    """The two grays that a UR5 mostly has, RGB in 0..255."""
 
-    Raises:
-        ValueError: when the point is out of the arm's reach.
+    dark: RGB = (50, 50, 50)
+    """Shoulder, forearm, second wrist and gripper."""
+    light: RGB = (203, 203, 203)
+    """Upper arm, first and third wrist."""
+
+    @property
+    def links(self) -> tuple[RGB, ...]:
+        """By index of the link; the base, which PyBullet counts as -1, is the last."""
+        dark, light = self.dark, self.light
+        return dark, light, dark, light, dark, light, CUP_RGB, dark, FOOT_RGB
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How an arm is built and where its tip may be, in metres."""
+
+    home: Point
+    """Where the tip rests."""
+    reach_low: Point
+    reach_high: Point
+    """The tip's commanded place is kept within these corners, and within the arm's own reach."""
+    tool: float = TOOL
+    """Length of the suction gripper below the flange."""
+    paint: Paint | None = None
+    """None: a plain arm of cylinders in `ROBOT_RGB`."""
+
+    @property
+    def home_joints(self) -> Joints:
+        return self.inverse(self.home, 0.0)
+
+    def inverse(self, position: Point, yaw: float) -> Joints:
+        """Joint angles (radians, elbow up) that hold the tip at ``position`` (metres), pointing straight down.
+
+        Raises:
+            ValueError: when the point is out of the arm's reach.
+        """
+        x, y, z = position
+        reach = hypot(x, y)
+        if reach <= D4:
+            raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is too close to the robot's base")
+        pan = atan2(y, x) - asin(D4 / reach)
+        radial = sqrt(reach * reach - D4 * D4) - D5
+        height = z + self.tool + D6 - D1
+        distance = hypot(radial, height)
+        if not abs(A2 - A3) < distance < A2 + A3 - 1e-3:
+            raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is out of the arm's reach")
+        at_shoulder = acos((A2 * A2 + distance * distance - A3 * A3) / (2 * A2 * distance))
+        at_elbow = acos((A2 * A2 + A3 * A3 - distance * distance) / (2 * A2 * A3))
+        lift = -atan2(height, radial) - at_shoulder
+        elbow = pi - at_elbow
+        return pan, lift, elbow, -lift - elbow, 0.0, yaw - pan
+
+    def forward(self, joints: Joints) -> tuple[Point, float]:
+        """Tip position in metres and yaw in radians for joint angles with a vertical tool (wrist2 = 0)."""
+        pan, lift, elbow, wrist1, _, wrist3 = joints
+        wrist_pitch = lift + elbow + wrist1
+        drop = self.tool + D6
+        radial = A2 * cos(lift) + A3 * cos(lift + elbow) + D5 * cos(wrist_pitch) - drop * sin(wrist_pitch)
+        z = D1 - A2 * sin(lift) - A3 * sin(lift + elbow) - D5 * sin(wrist_pitch) - drop * cos(wrist_pitch)
+        x = radial * cos(pan) - D4 * sin(pan)
+        y = radial * sin(pan) + D4 * cos(pan)
+        return (x, y, z), pan + wrist3
+
+    def within_reach(self, point: Point) -> Point:
+        """The nearest allowed place, found axis by axis; over far places the tip hangs lower."""
+        x, y, z = (
+            min(max(value, low), high)
+            for value, low, high in zip(point, self.reach_low, self.reach_high, strict=True)
+        )
+        longest, drop = A2 + A3 - 2e-3, D6 + self.tool - D1
+        lowest = self.reach_low[2] + drop
+        furthest = hypot(sqrt(longest**2 - lowest**2) + D5, D4)
+        if (reach := hypot(x, y)) > furthest:
+            x, y = x * furthest / reach, y * furthest / reach
+        radial = sqrt(x * x + y * y - D4 * D4) - D5
+        return x, y, min(z, sqrt(longest**2 - radial * radial) - drop)
+
+
+def arm_urdf(arm: Arm) -> str:
+    """Path of the generated URDF. Only the suction cup can touch things; the other links are for the eye.
+
+    A painted arm has the UR5's real shape if its package is installed, else cylinders.
     """
-    x, y, z = position
-    reach = hypot(x, y)
-    if reach <= D4:
-        raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is too close to the robot's base")
-    pan = atan2(y, x) - asin(D4 / reach)
-    radial = sqrt(reach * reach - D4 * D4) - D5
-    height = z + TOOL + D6 - D1
-    distance = hypot(radial, height)
-    if not abs(A2 - A3) < distance < A2 + A3 - 1e-3:
-        raise ValueError(f"the point ({x:.3f}, {y:.3f}, {z:.3f}) m is out of the arm's reach")
-    at_shoulder = acos((A2 * A2 + distance * distance - A3 * A3) / (2 * A2 * distance))
-    at_elbow = acos((A2 * A2 + A3 * A3 - distance * distance) / (2 * A2 * A3))
-    lift = -atan2(height, radial) - at_shoulder
-    elbow = pi - at_elbow
-    return pan, lift, elbow, -lift - elbow, 0.0, yaw - pan
-
-
-def forward_kinematics(joints: Joints) -> tuple[Point, float]:
-    """Tip position in metres and yaw in radians for joint angles with a vertical tool (wrist2 = 0)."""
-    pan, lift, elbow, wrist1, _, wrist3 = joints
-    wrist_pitch = lift + elbow + wrist1
-    drop = TOOL + D6
-    radial = A2 * cos(lift) + A3 * cos(lift + elbow) + D5 * cos(wrist_pitch) - drop * sin(wrist_pitch)
-    z = D1 - A2 * sin(lift) - A3 * sin(lift + elbow) - D5 * sin(wrist_pitch) - drop * cos(wrist_pitch)
-    x = radial * cos(pan) - D4 * sin(pan)
-    y = radial * sin(pan) + D4 * cos(pan)
-    return (x, y, z), pan + wrist3
-
-
-def arm_urdf() -> str:
-    """Path of the generated URDF. Only the suction cup can touch things; the other links are for the eye."""
-    tool_z = -D6 - TOOL
-    links = [
-        _link("base", 2.0, [_cylinder(0.075, D1 + 0.05, (0, 0, D1 / 2 - 0.02))]),
-        _link(
-            "shoulder", 1.0, [_cylinder(0.06, SHOULDER_OFFSET + 0.06, (0, SHOULDER_OFFSET / 2, 0), along="y")]
-        ),
-        _link("upper_arm", 1.0, [_cylinder(0.055, A2, (A2 / 2, 0, 0), along="x")]),
-        _link("forearm", 1.0, [_cylinder(0.045, A3, (A3 / 2, 0, 0), along="x")]),
-        _link("wrist1", 0.3, [_cylinder(0.04, 0.12, (0, 0, 0), along="y")]),
-        _link("wrist2", 0.3, [_cylinder(0.04, D5 + 0.04, (D5 / 2 + 0.01, 0, 0), along="x")]),
-        _link(
-            "gripper",
-            0.2,
-            [
-                _cylinder(FLANGE_RADIUS, D6 + 0.045, (0, 0, tool_z + TOOL - 0.005 + (D6 + 0.045) / 2 - 0.04)),
-                _cylinder(0.027, TOOL, (0, 0, tool_z + TOOL / 2 + 0.003)),
-            ],
-        ),
-        _link("tip", 0.01, [], contact=f'<cylinder radius="{TIP_RADIUS}" length="0.01"/>', contact_z=0.005),
-    ]
+    tool_z = -D6 - arm.tool
+    looks = {
+        "base": [_cylinder(0.075, D1 + 0.05, (0, 0, D1 / 2 - 0.02))],
+        "shoulder": [_cylinder(0.06, SHOULDER_OFFSET + 0.06, (0, SHOULDER_OFFSET / 2, 0), along="y")],
+        "upper_arm": [_cylinder(0.055, A2, (A2 / 2, 0, 0), along="x")],
+        "forearm": [_cylinder(0.045, A3, (A3 / 2, 0, 0), along="x")],
+        "wrist1": [_cylinder(0.04, 0.12, (0, 0, 0), along="y")],
+        "wrist2": [_cylinder(0.04, D5 + 0.04, (D5 / 2 + 0.01, 0, 0), along="x")],
+        "gripper": [
+            _cylinder(FLANGE_RADIUS, D6 + 0.045, (0, 0, tool_z + arm.tool - 0.005 + (D6 + 0.045) / 2 - 0.04))
+        ],
+    }
+    cup, tool, tool_joint = [], [], []
+    if arm.paint is None:
+        looks["gripper"].append(_cylinder(0.027, arm.tool, (0, 0, tool_z + arm.tool / 2 + 0.003)))
+    else:
+        looks |= {name: [_mesh(path)] for name, path in ur5_meshes().items()}
+        cup = [_cylinder(0.0095, 0.016, (0, 0, 0.0025))]
+        parts = [_cylinder(r, length, (0, 0, z - D6)) for r, length, z in GRIPPER]
+        tool, tool_joint = [_link("tool", 0.01, parts)], [_fixed("tool", 0.0)]
+    masses = (2.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.2)
+    links = [_link(name, mass, looks[name]) for name, mass in zip(looks, masses, strict=True)]
+    contact = f'<cylinder radius="{TIP_RADIUS}" length="0.01"/>'
+    links += [_link("tip", 0.01, cup, contact=contact, contact_z=0.005), *tool]
     joints = [
         _joint("pan", "base", "shoulder", (0, 0, D1), "0 0 1"),
         _joint("lift", "shoulder", "upper_arm", (0, SHOULDER_OFFSET, 0), "0 1 0"),
@@ -95,11 +157,22 @@ def arm_urdf() -> str:
         _joint("wrist1", "forearm", "wrist1", (A3, D4 - SHOULDER_OFFSET + ELBOW_OFFSET, 0), "0 1 0"),
         _joint("wrist2", "wrist1", "wrist2", (0, 0, 0), "1 0 0"),
         _joint("wrist3", "wrist2", "gripper", (D5, 0, 0), "0 0 1"),
-        f'<joint name="tip" type="fixed"><parent link="gripper"/><child link="tip"/>'
-        f'<origin xyz="0 0 {tool_z}"/></joint>',
+        _fixed("tip", tool_z),
+        *tool_joint,
     ]
     text = '<?xml version="1.0"?>\n<robot name="arm">\n' + "\n".join(links + joints) + "\n</robot>\n"
     return generated_file("arm", ".urdf", text)
+
+
+def _fixed(name: str, z: float) -> str:
+    return (
+        f'<joint name="{name}" type="fixed"><parent link="gripper"/><child link="{name}"/>'
+        f'<origin xyz="0 0 {z}"/></joint>'
+    )
+
+
+def _mesh(path: str) -> str:
+    return f'<visual><geometry><mesh filename="{path}"/></geometry></visual>'
 
 
 def _link(name: str, mass: float, visuals: list[str], contact: str = "", contact_z: float = 0.0) -> str:

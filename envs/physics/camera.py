@@ -48,18 +48,20 @@ class Camera:
 
     preset: CameraPreset
     size: int
+    oversampling: int = 1
+    """Pixels are averages of this many drawn pixels along each axis; masks show the one at the centre."""
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
         """(3, 3) ``K``: a point (X, Y, Z) of the camera frame has u = fx X/Z + cx, v = fy Y/Z + cy.
 
         PyBullet's TinyRenderer samples a pixel at its lower left corner instead of its centre (measured:
-        masks sit half a pixel right and up of the projected bodies, at any image size), hence the halves in
-        cx and cy.
+        masks sit half a pixel right and up of the projected bodies, at any image size), hence the shift of
+        cx and cy. Of an even number of drawn pixels one has that corner at the centre of their average.
         """
-        half = self.size / 2
+        half, shift = self.size / 2, (self.oversampling % 2) / (2 * self.oversampling)
         fy = half / tan(radians(self.preset.fov) / 2)
-        return np.array([[fy / self.preset.aspect, 0, half + 0.5], [0, fy, half - 0.5], [0, 0, 1]])
+        return np.array([[fy / self.preset.aspect, 0, half + shift], [0, fy, half - shift], [0, 0, 1]])
 
     @property
     def extrinsics(self) -> NDArray[np.float64]:

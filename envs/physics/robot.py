@@ -12,17 +12,8 @@ import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 
-from envs.physics.arm import TIP_LINK, Joints, Point, forward_kinematics, inverse_kinematics
+from envs.physics.arm import TIP_LINK, Joints, Point
 from envs.physics.simulation import Tabletop
-
-HOME: Point = (0.348, 0.0, 0.13)
-"""Where the tip rests: seen at the upper edge of the `close` view, in front of no object."""
-
-HOME_JOINTS: Joints = inverse_kinematics(HOME, 0.0)
-
-REACH_LOW: Point = (0.20, -0.30, 0.006)
-REACH_HIGH: Point = (0.78, 0.30, 0.25)
-"""The tip's commanded place is kept within these corners (metres); all of it can be reached."""
 
 CONTACT = 0.002
 """Gap in metres at which the suction cup seals, and at which a downward motion stops."""
@@ -50,15 +41,18 @@ class Robot:
         self.world = world
         self.frame_steps = frame_steps
         self._joints = list(range(6))
-        self.reset(HOME_JOINTS)
+        self.reset(world.setup.arm.home_joints)
 
-    def reset(self, joints: Joints) -> None:
-        """Take over an arm that was just built at ``joints`` (tool upright)."""
-        self.target, self.yaw = forward_kinematics(joints)
+    def reset(self, joints: Joints, holding: int = -1) -> None:
+        """Take over an arm that was just built at ``joints`` (tool upright), ``holding`` a block or nothing."""
+        self.arm = self.world.setup.arm
+        self.target, self.yaw = self.arm.forward(joints)
         self.holding = -1
         self.touched = False
         self._grip = -1
         self._angles = np.array(joints)
+        if holding >= 0:
+            self._seal(holding)
 
     @property
     def frame_time(self) -> float:
@@ -77,7 +71,7 @@ class Robot:
         ``suction`` on, a block that the cup touches is held; without, it is let go.
         """
         start, yaw = np.array(self.target), self.yaw
-        end = np.clip(start + delta, REACH_LOW, REACH_HIGH)
+        end = np.array(self.arm.within_reach(tuple(start + delta)))
         lowering = bool(end[2] < start[2])
         self.touched = False
         if not suction:
@@ -86,7 +80,7 @@ class Robot:
             share = step / self.frame_steps
             self.target = tuple(start + share * (end - start))
             self.yaw = yaw + share * dyaw
-            self._drive(np.array(inverse_kinematics(self.target, self.yaw)))
+            self._drive(np.array(self.arm.inverse(self.target, self.yaw)))
             self.world.step()
             if suction and self.holding < 0:
                 self._try_grip()

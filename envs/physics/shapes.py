@@ -6,7 +6,7 @@ import hashlib
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from itertools import pairwise
 from math import cos, hypot, pi, sin
 from pathlib import Path
@@ -15,6 +15,12 @@ from envs.geometry import Sizes
 
 SEGMENTS = 24
 """Corners of the bowl's circle as seen."""
+
+ARC = 5
+"""Bands of a round wall."""
+
+STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))
+"""Normals (outward, upward) around a round bowl's floor."""
 
 WALL_PARTS = 12
 """Convex parts of the bowl's wall as felt: one per wall segment. A block's edge never meets their corners."""
@@ -29,15 +35,15 @@ class Mesh:
     indices: list[int]
 
 
-@cache
-def bowl_mesh(sizes: Sizes) -> Mesh:
-    """The visible bowl: a lathed profile, smooth around the axis, with an edge between two bands of the
-    profile."""
-    profile = _bowl_profile(sizes)
+@lru_cache(maxsize=16)
+def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
+    """The visible bowl, conical or ``rounded``: a lathed profile, smooth around the axis, with an edge between
+    two bands of the profile."""
+    profile = _round_profile(sizes) if rounded else _bowl_profile(sizes)
     vertices: list[list[float]] = []
     normals: list[list[float]] = []
     indices: list[int] = []
-    for (r0, z0), (r1, z1) in pairwise(profile):
+    for band, ((r0, z0), (r1, z1)) in enumerate(pairwise(profile)):
         length = hypot(r1 - r0, z1 - z0)
         # The profile runs with the solid on its left, so the outward normal is its direction turned right.
         normal_r, normal_z = (z1 - z0) / length, -(r1 - r0) / length
@@ -45,7 +51,11 @@ def bowl_mesh(sizes: Sizes) -> Mesh:
         for k in range(SEGMENTS + 1):
             c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
             vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
-            normals += [[normal_r * c, normal_r * s, normal_z]] * 2
+            ends = [(normal_r, normal_z)] * 2
+            if rounded and ARC < band <= 2 * ARC:
+                # As CLIPort's bowls look: the inner wall is shaded as if steep, the lowest band as a star.
+                ends = [(-1.0, 0.0)] * 2 if band < 2 * ARC else [STAR[k % 3], (0.0, 1.0)]
+            normals += [[r * c, r * s, z] for r, z in ends]
         for k in range(SEGMENTS):
             a = first + 2 * k
             if r0 > 0:
@@ -66,7 +76,19 @@ def _bowl_profile(sizes: Sizes) -> list[tuple[float, float]]:
     ]
 
 
-@cache
+def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
+    """The same for a bowl that is round inside and outside."""
+    flat, height = 0.45 * sizes.bowl_radius, sizes.bowl_height
+
+    def arc(rim: float, low: float) -> list[tuple[float, float]]:
+        angles = [pi / 2 * k / ARC for k in range(ARC + 1)]
+        return [(flat + (rim - flat) * sin(a), low + (height - low) * (1 - cos(a))) for a in angles]
+
+    outside, inside = arc(sizes.bowl_radius, 0.0), arc(sizes.bowl_inner_radius, sizes.bowl_floor)
+    return [*outside, *reversed(inside), (0.0, sizes.bowl_floor)]
+
+
+@lru_cache(maxsize=16)
 def bowl_contact_file(sizes: Sizes) -> str:
     """Path of an OBJ file with one convex group per part of the bowl: its floor, and each segment of its
     wall.

@@ -168,14 +168,17 @@ class Task:
         """The ids of what is named.
 
         Raises:
-            ValueError: when the scene does not have a named thing.
+            ValueError: when the scene does not have a named thing, or more than one that is called so.
         """
-        ids = {item.thing: index for index, item in enumerate(objects)}
+        things = [item.thing for item in objects]
+        ids = {thing: index for index, thing in enumerate(things)}
         steps = tuple(instructions)
         for thing in (thing for step in steps for thing in step.things):
             if thing not in ids:
                 there = ", ".join(str(item.thing) for item in objects)
                 raise ValueError(f"the scene has no {thing}; it has: {there}")
+            if things.count(thing) > 1:
+                raise ValueError(f"the scene has {things.count(thing)} objects that are a {thing}")
         return tuple(GoalPair(step.relation, ids[step.thing], ids[step.target]) for step in steps)
 
     def request(self, n_pairs: int = 1) -> SceneRequest:
@@ -227,8 +230,11 @@ class Task:
         )
 
     def _pairs(self, objects: Sequence[ObjectSpec]) -> list[GoalPair]:
-        """All pairs of objects of the right kinds."""
-        ids = range(len(objects))
+        """All pairs of objects of the right kinds that have a name of their own and nothing on top."""
+        things, covered = [item.thing for item in objects], {item.on for item in objects}
+        ids = [
+            index for index, thing in enumerate(things) if things.count(thing) == 1 and index not in covered
+        ]
         return [
             GoalPair(relation.name, thing, target)
             for relation in self.relations

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envs import Expert
-from envs.physics.robot import HOME
+from envs.scenes import SIMPLE
 
 Make = Callable[..., gym.Env[Any, Any]]
 STARTS = (
@@ -78,7 +78,7 @@ def test_an_episode_has_about_25_frames_and_ends_as_it_began(make: Make) -> None
         named |= np.isin(info["segmentation"], 2 + info["target"])
         change = np.abs(frames[0][-1].astype(int) - start)[~named]
         assert (change < 12).mean() > 0.99
-        assert np.allclose(info["gripper"]["position"], HOME, atol=0.005)
+        assert np.allclose(info["gripper"]["position"], SIMPLE.arm.home, atol=0.005)
 
 
 def test_the_expert_plays_every_instruction_of_a_scene(make: Make) -> None:

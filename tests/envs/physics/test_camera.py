@@ -10,6 +10,7 @@ import pybullet as p
 import pytest
 
 from envs.colors import COLORS, ROBOT_RGB
+from envs.factors import Factors
 from envs.geometry import SPAWN, WORKSPACE, Sizes
 from envs.physics.camera import PRESETS, Camera
 
@@ -17,9 +18,9 @@ Make = Callable[..., gym.Env[Any, Any]]
 SIZES = Sizes()
 
 
-def block_corners(block: dict[str, Any]) -> np.ndarray:
+def block_corners(block: dict[str, Any], edge: float = SIZES.block) -> np.ndarray:
     """The 8 corners (8, 3) of a block, in the world."""
-    half = SIZES.block / 2
+    half = edge / 2
     turn = np.array(p.getMatrixFromQuaternion(block["orientation"])).reshape(3, 3)
     return block["position"] + np.array(list(product((-half, half), repeat=3))) @ turn.T
 
@@ -31,15 +32,24 @@ def project(camera: dict[str, np.ndarray], points: np.ndarray) -> np.ndarray:
     return in_image[:, :2] / in_image[:, 2:]
 
 
-@pytest.mark.parametrize("camera", PRESETS)
-def test_projected_corners_bound_the_segmented_blocks(make: Make, camera: str) -> None:
+VIEWS = {
+    "close": {},
+    "paper": {"camera": "paper"},
+    "cliport": {"scene": "cliport"},
+    "moved": {"scene": "varied", "factors": Factors().without(["on_block", "carried"])},
+}
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_projected_corners_bound_the_segmented_blocks(make: Make, view: dict[str, Any]) -> None:
     """Exact to half a pixel: pixel column c covers u from c to c + 1."""
-    env = make(camera=camera, image_size=336)
+    env = make(image_size=336, **view)
     worst = 0.0
     for seed in range(3):
         _, info = env.reset(seed=seed, options={"n_bowls": 1})
         for block in (item for item in info["objects"] if item["kind"] == "block"):
-            corners = project(info["camera"], block_corners(block))
+            edge = env.unwrapped.world.sizes.block
+            corners = project(info["camera"], block_corners(block, edge))
             rows, columns = np.nonzero(info["segmentation"] == 2 + block["id"])
             seen = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
             expected = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
@@ -51,15 +61,17 @@ def test_projected_corners_bound_the_segmented_blocks(make: Make, camera: str) -
     assert 0 < worst < 1.6
 
 
-@pytest.mark.parametrize(("camera", "size"), [("close", 64), ("close", 336), ("paper", 336)])
-def test_the_grid_of_pixels_is_not_shifted(make: Make, camera: str, size: int) -> None:
+@pytest.mark.parametrize(
+    ("view", "size"), [("close", 64), ("close", 336), ("paper", 336), ("cliport", 336), ("moved", 336)]
+)
+def test_the_grid_of_pixels_is_not_shifted(make: Make, view: str, size: int) -> None:
     """Over many blocks, bounding boxes of masks and of projected corners are centred to a fifth of a pixel."""
-    env = make(camera=camera, image_size=size)
+    env = make(image_size=size, **VIEWS[view])
     shifts = []
     for seed in range(6):
         _, info = env.reset(seed=seed, options={"n_bowls": 1, "n_objects": 4})
         for block in (item for item in info["objects"] if item["kind"] == "block"):
-            corners = project(info["camera"], block_corners(block))
+            corners = project(info["camera"], block_corners(block, env.unwrapped.world.sizes.block))
             rows, columns = np.nonzero(info["segmentation"] == 2 + block["id"])
             center = np.array([columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]) / 2
             shifts.append(center - (corners.min(axis=0) + corners.max(axis=0)) / 2)
