@@ -81,9 +81,11 @@ class SceneParser(nn.Module):
         config: what it was built from.
         layout: what the numbers of one slot mean.
         dino: its frozen image encoder, which is no part of the checkpoint; None if it learns its encoder.
+        taught: whether it learns from masks, by `lesson_loss`.
     """
 
     Config: ClassVar[type[ParserConfig]]
+    taught: ClassVar[bool] = False
     config: ParserConfig
 
     def __init__(self, config: ParserConfig) -> None:
@@ -107,6 +109,14 @@ class SceneParser(nn.Module):
             generator: where the initial slots are drawn from, on the frames' device; PyTorch's own by
                 default. One for each clip, on any device: what is drawn for a clip then does not depend on
                 which others are parsed with it.
+        """
+        raise NotImplementedError
+
+    def lesson_loss(self, frames_N3HW: Tensor, labels_NHW: Tensor) -> Tensor:
+        """What a parser that is taught gets wrong of single frames, a mean over them.
+
+        Args:
+            labels_NHW: 0 background, 1 robot, and one other number for each object of a frame.
         """
         raise NotImplementedError
 

@@ -26,25 +26,37 @@ from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
 
 
 @dataclass(frozen=True)
-class PlacedConfig(ParserConfig):
-    """Options of `PlacedParser`.
+class CropConfig(ParserConfig):
+    """Options of `PlacedCorrector`.
 
     Attributes:
         crop_cells: side in cells of the canonical picture in which the corrector reads a slot.
         crop_extent: how many standard deviations that picture reaches to each side.
         hidden: width of the corrector's fully connected layers.
+    """
+
+    crop_cells: int = 24
+    crop_extent: float = 2.6
+    hidden: int = 256
+
+    def __post_init__(self) -> None:
+        self._check_layout(explicit=True)
+
+
+@dataclass(frozen=True)
+class PlacedConfig(CropConfig):
+    """Options of `PlacedParser`.
+
+    Attributes:
         transition_heads, transition_hidden: the transformer block between frames.
     """
 
     kind: Literal["placed"] = "placed"
-    crop_cells: int = 24
-    crop_extent: float = 2.6
-    hidden: int = 256
     transition_heads: int = 4
     transition_hidden: int = 128
 
     def __post_init__(self) -> None:
-        self._check_layout(explicit=True)
+        super().__post_init__()
         self._check_heads(2 * self.layout.content, self.transition_heads)
 
 
@@ -101,7 +113,7 @@ class PlacedCorrector(nn.Module):
         min_pixels: a slot that gets less than this is hidden; it keeps what it had.
     """
 
-    def __init__(self, config: PlacedConfig, min_pixels: float = 3.0) -> None:
+    def __init__(self, config: CropConfig, min_pixels: float = 3.0) -> None:
         super().__init__()
         content = config.layout.content
         self.cells = config.crop_cells

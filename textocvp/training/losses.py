@@ -33,18 +33,19 @@ class ParserLoss(LossTerms):
         place: squared error of the places that the transition expected against those the corrector found; for slots
             without explicit places, of those that the renderer reads off them against those of their attention.
         feature: mean squared error of the reconstructed features, for renderers that have any.
+        lesson: what a parser that is taught gets wrong.
     """
 
     image: Tensor
     mask: Tensor
     place: Tensor
     feature: Tensor
+    lesson: Tensor
 
     def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
-        return (
-            self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
-        )
+        learned = self.image + mask_weight * self.mask + place_weight * self.place
+        return learned + feature_weight * self.feature + self.lesson
 
 
 def thing_weights(target: Tensor, thing_weight: float, threshold: float = 0.08) -> Tensor:
