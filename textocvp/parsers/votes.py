@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.optimize import linear_sum_assignment
@@ -250,20 +251,20 @@ def hand_out(
     off_BKP = torch.cdist(state.position + speed_BK2, position_BP2) / reach_BK1
     hue_BKP = torch.cdist(color_features(state.color), color_features(color_BP3))
     size_BKP = (scale_BP2.log().mean(-1)[:, None] - state.scale.log().mean(-1)[..., None]).abs()
-    cost_BKP = (torch.log1p(off_BKP.square()) + COLOR_COST * hue_BKP + SIZE_COST * size_BKP).cpu()
+    cost_BKP = (torch.log1p(off_BKP.square()) + COLOR_COST * hue_BKP + SIZE_COST * size_BKP).detach().cpu()
 
     B, K, P = cost_BKP.shape
     owner_BPK = torch.zeros(B, P, K)
+    shown_BP, used_BK = (area_BP > 0).cpu().numpy(), state.is_thing[..., 0].cpu().numpy()
     for b in range(B):
-        used, free = state.is_thing[b, 2:, 0].cpu(), 2 + (~state.is_thing[b, 2:, 0].cpu()).nonzero()[:, 0]
-        slots, shown = 2 + used.nonzero()[:, 0], (area_BP[b] > 0).nonzero()[:, 0].cpu()
-        costs = cost_BKP[b][slots][:, shown]
-        rows, columns = linear_sum_assignment(costs.clamp(max=MOST_COST))
+        shown, used = np.flatnonzero(shown_BP[b]), 2 + np.flatnonzero(used_BK[b, 2:])
+        costs = cost_BKP[b].numpy()[np.ix_(used, shown)].clip(max=MOST_COST)
+        rows, columns = linear_sum_assignment(costs)
         sure = costs[rows, columns] < MOST_COST
-        rows, columns = rows[sure], columns[sure]
-        owner_BPK[b, shown[columns], slots[rows]] = 1
-        new = shown[~torch.isin(torch.arange(len(shown)), torch.as_tensor(columns))][: len(free)]
-        owner_BPK[b, new, free[: len(new)]] = 1
+        owner_BPK[b, shown[columns[sure]], used[rows[sure]]] = 1
+        pairs = zip(np.delete(shown, columns[sure]), 2 + np.flatnonzero(~used_BK[b, 2:]), strict=False)
+        for new, free in pairs:
+            owner_BPK[b, new, free] = 1
     attention_BKHW = torch.einsum("bpk,bphw->bkhw", owner_BPK.to(masks_BPHW.device), masks_BPHW)
     attention_BKHW[:, 1] = found.robot_BHW.float()
     attention_BKHW[:, 0] = 1 - attention_BKHW[:, 1:].sum(1)
