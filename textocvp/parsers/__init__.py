@@ -12,9 +12,9 @@ __all__ = ["PARSERS", "Parsed", "ParserConfig", "SceneParser", "build_parser", "
 
 PARSERS: dict[str, type[SceneParser]] = {
     "placed": PlacedParser,  # slots with explicit colour, place and size: the parser that ships
-    "votes": VotesParser,  # the same slots, found by a network that has learned to see
     "savi": SaviParser,  # published: slots are unexplained vectors
     "holistic": HolisticParser,  # no slots, one vector a frame: Non-OC
+    "votes": VotesParser,  # slots as in `placed`, found by a network that has learned to see
 }
 
 
