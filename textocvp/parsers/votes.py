@@ -32,7 +32,8 @@ SIZE_UNIT = (
     12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
 )
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
-PEAK_RADIUS = 3.5  # pixels within which there is no second object
+PEAK_RADIUS = 5.0  # pixels within which there is no second object
+MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 2000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
 UNSEEN = 0.0  # colour of a slot that holds nothing yet
@@ -216,6 +217,9 @@ def decode(logits_B3HW: Tensor, votes_B3HW: Tensor, most: int, min_votes: float 
         near_SS = torch.cdist(some_S3, some_S3)
         weight = len(votes_L3) / len(some_S3)
         density_S = weight * torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1)
+        # Large objects need more votes: else the stray ones of their borders would be objects of their own.
+        full_S = 6 * (2 / SIZE_UNIT * some_S3[:, 2]).exp()  # pixels of a filled square of that radius
+        density_S = density_S.masked_fill(density_S < MIN_SHARE * full_S, 0.0)
         peaks: list[int] = []
         for _ in range(most):
             height, index = density_S.max(0)
