@@ -41,7 +41,7 @@ UNSEEN = 0.0  # colour of a slot that holds nothing yet
 # What it costs to take a thing for that of a slot: log(1 + d^2), d its distance in units of three times the slot's size
 # and SEARCH together, and its differences in colour and log-size.
 SEARCH = 0.08
-COLOR_COST, SIZE_COST, MOST_COST = 4.0, 0.5, 6.0
+COLOR_COST, SIZE_COST, NEW_COST, MOST_COST = 4.0, 0.5, 1.5, 6.0
 
 
 @dataclass(frozen=True)
@@ -183,102 +183,100 @@ def vote_loss(logits_N3HW: Tensor, votes_N3HW: Tensor, targets: VoteTargets) -> 
 
 
 @dataclass
-class Found:
-    """What one frame of each clip shows, in any order.
+class Ballot:
+    """The votes of one frame's object pixels, and the objects that they elect.
 
     Attributes:
-        robot_BHW: bool.
-        masks_BPHW: bool, at most one object a pixel; empty for objects that there are not.
+        pixels: rows and columns of the L pixels.
+        votes_L3: where they say that their object's centre is, (x, y) in pixels and its size.
+        peaks_P3: where these are densest, the densest first.
     """
 
-    robot_BHW: Tensor
-    masks_BPHW: Tensor
+    pixels: tuple[Tensor, Tensor]
+    votes_L3: Tensor
+    peaks_P3: Tensor
+
+    def elect(self, candidates_C3: Tensor) -> Tensor:
+        """To which of some candidates each pixel goes (L,): the one nearest to its vote."""
+        return torch.cdist(self.votes_L3, candidates_C3).argmin(1)
 
 
-@torch.no_grad()
-def decode(logits_B3HW: Tensor, votes_B3HW: Tensor, most: int, min_votes: float = 4.0) -> Found:
-    """Find where the votes of object pixels are densest, and give each pixel to the place nearest to its vote.
+def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: float = 4.0) -> Ballot:
+    """Find where the votes of object pixels are densest.
 
     Args:
-        most: P, how many objects a frame can have; the densest are kept.
+        most: how many objects a frame can have at most.
         min_votes: an object has at least so many votes within `VOTE_SPREAD` or so.
     """
-    classes_BHW = logits_B3HW.argmax(1)
-    B, H, W = classes_BHW.shape
-    masks_BPHW = torch.zeros(B, most, H, W, dtype=torch.bool, device=votes_B3HW.device)
-    for b in range(B):
-        y_L, x_L = (classes_BHW[b] == OBJECT).nonzero(as_tuple=True)
-        if len(y_L) < MIN_AREA:
-            continue
-        votes_L3 = votes_B3HW[b, :, y_L, x_L].T
-        votes_L3[:, 0] += x_L
-        votes_L3[:, 1] += y_L
-        some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
-        near_SS = torch.cdist(some_S3, some_S3)
-        weight = len(votes_L3) / len(some_S3)
-        density_S = weight * torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1)
-        # Large objects need more votes: else the stray ones of their borders would be objects of their own.
-        full_S = 6 * (2 / SIZE_UNIT * some_S3[:, 2]).exp()  # pixels of a filled square of that radius
-        density_S = density_S.masked_fill(density_S < MIN_SHARE * full_S, 0.0)
-        peaks: list[int] = []
-        for _ in range(most):
-            height, index = density_S.max(0)
-            if height < min_votes:
-                break
-            peaks.append(int(index))
-            density_S = density_S.masked_fill(near_SS[index] < PEAK_RADIUS, 0.0)
-        if peaks:
-            masks_BPHW[b, torch.cdist(votes_L3, some_S3[peaks]).argmin(1), y_L, x_L] = True
-    masks_BPHW &= (masks_BPHW.sum((2, 3)) >= MIN_AREA)[..., None, None]
-    return Found(classes_BHW == ROBOT, masks_BPHW)
+    y_L, x_L = (logits_3HW.argmax(0) == OBJECT).nonzero(as_tuple=True)
+    votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
+    some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
+    near_SS = torch.cdist(some_S3, some_S3)
+    density_S = (
+        torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1) * len(votes_L3) / max(1, len(some_S3))
+    )
+    # Large objects need more votes: else the stray ones of their borders would be objects of their own.
+    enough_S = (MIN_SHARE * _pixels_of(some_S3)).clamp_min(min_votes)
+    density_S = density_S.masked_fill(density_S < enough_S, 0.0)
+    peaks: list[int] = []
+    while len(peaks) < most and len(some_S3) and density_S.max() > 0:
+        peaks.append(int(density_S.argmax()))
+        density_S = density_S.masked_fill(near_SS[peaks[-1]] < PEAK_RADIUS, 0.0)
+    return Ballot((y_L, x_L), votes_L3, some_S3[peaks])
 
 
-@torch.no_grad()
-def hand_out(
-    found: Found, frames_B3HW: Tensor, state: SlotState, speed_BK2: Tensor
-) -> tuple[SlotState, Tensor]:
-    """Give what a frame shows to the slots by place, colour and size; what no slot knows takes an unused one.
+def _pixels_of(votes_N3: Tensor) -> Tensor:
+    """(N,) how many pixels a filled square has whose size is voted for."""
+    return 6 * (2 / SIZE_UNIT * votes_N3[:, 2]).exp()
+
+
+def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, first: int = 2) -> Tensor:
+    """The slot (L,) of each of one frame's object pixels, by place, colour and size.
 
     Args:
-        state: slots of the frame before.
-        speed_BK2: how far they moved in it.
-
-    Returns:
-        the slots, new ones with colour and presence, and what each covers (B, K, H, W), which sums to 1.
+        state: slots (K,) of the frame before.
+        speed_K2: how far they moved in it.
+        first: number of the first slot for an object. What none of them knows takes an unused one.
     """
-    masks_BPHW, colors_BN3 = found.masks_BPHW.float(), frames_B3HW.flatten(2).transpose(1, 2)
-    area_BP = masks_BPHW.sum((2, 3))
-    position_BP2, scale_BP2 = moments(masks_BPHW)
-    color_BP3 = masks_BPHW.flatten(2) @ colors_BN3 / area_BP[..., None].clamp_min(1)
+    (H, W), P = frame_3HW.shape[1:], len(ballot.peaks_P3)
+    if P == 0:
+        return torch.zeros_like(ballot.pixels[0])
+    winner_L = ballot.elect(ballot.peaks_P3)
+    masks_PHW = frame_3HW.new_zeros(P, H, W)
+    masks_PHW[(winner_L, *ballot.pixels)] = 1
+    position_P2, scale_P2 = (values[0] for values in moments(masks_PHW[None]))
+    mass_P1 = masks_PHW.sum((1, 2))[:, None].clamp_min(1)
+    hue_P4 = color_features(masks_PHW.flatten(1) @ frame_3HW.flatten(1).T / mass_P1)
 
-    reach_BK1 = (3 * state.scale.mean(-1) + SEARCH)[..., None]
-    off_BKP = torch.cdist(state.position + speed_BK2, position_BP2) / reach_BK1
-    hue_BKP = torch.cdist(color_features(state.color), color_features(color_BP3))
-    size_BKP = (scale_BP2.log().mean(-1)[:, None] - state.scale.log().mean(-1)[..., None]).abs()
-    cost_BKP = (torch.log1p(off_BKP.square()) + COLOR_COST * hue_BKP + SIZE_COST * size_BKP).detach().cpu()
+    reach_K1 = 3 * state.scale.mean(-1, keepdim=True) + SEARCH
+    off_KP = torch.cdist(state.position + speed_K2, position_P2) / reach_K1
+    size_KP = (scale_P2.log().mean(-1) - state.scale.log().mean(-1, keepdim=True)).abs()
+    cost_KP = torch.log1p(off_KP.square()) + COLOR_COST * torch.cdist(color_features(state.color), hue_P4)
+    used_K = state.is_thing[:, 0].cpu().numpy()
+    used, free = (first + np.flatnonzero(which) for which in (used_K[first:], ~used_K[first:]))
+    cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
+    rows, columns = linear_sum_assignment(cost_UP)
+    sure = cost_UP[rows, columns] < MOST_COST
+    owner_P = np.zeros(P, int)
+    owner_P[columns[sure]] = used[rows[sure]]
+    # What is left is a piece of a thing that fell apart, or it is new.
+    rest = np.flatnonzero(owner_P == 0)
+    pieces = cost_UP[:, rest].min(0, initial=MOST_COST) < NEW_COST
+    if pieces.any():
+        owner_P[rest[pieces]] = used[cost_UP[:, rest[pieces]].argmin(0)]
+    new = rest[~pieces][: len(free)]
+    owner_P[new] = free[: len(new)]
 
-    B, K, P = cost_BKP.shape
-    owner_BPK = torch.zeros(B, P, K)
-    shown_BP, used_BK = (area_BP > 0).cpu().numpy(), state.is_thing[..., 0].cpu().numpy()
-    for b in range(B):
-        shown, used = np.flatnonzero(shown_BP[b]), 2 + np.flatnonzero(used_BK[b, 2:])
-        costs = cost_BKP[b].numpy()[np.ix_(used, shown)].clip(max=MOST_COST)
-        rows, columns = linear_sum_assignment(costs)
-        sure = costs[rows, columns] < MOST_COST
-        owner_BPK[b, shown[columns[sure]], used[rows[sure]]] = 1
-        pairs = zip(np.delete(shown, columns[sure]), 2 + np.flatnonzero(~used_BK[b, 2:]), strict=False)
-        for new, free in pairs:
-            owner_BPK[b, new, free] = 1
-    attention_BKHW = torch.einsum("bpk,bphw->bkhw", owner_BPK.to(masks_BPHW.device), masks_BPHW)
-    attention_BKHW[:, 1] = found.robot_BHW.float()
-    attention_BKHW[:, 0] = 1 - attention_BKHW[:, 1:].sum(1)
-
-    area_BK1 = attention_BKHW.sum((2, 3))[..., None]
-    fresh_BK1 = (area_BK1 >= MIN_AREA) & (state.color == UNSEEN).all(-1, keepdim=True)
-    mean_BK3 = attention_BKHW.flatten(2) @ colors_BN3 / area_BK1.clamp_min(1)
-    color = torch.where(fresh_BK1, mean_BK3, state.color)
-    presence = torch.where(fresh_BK1 & state.is_unused, PRESENCE_THING, state.presence)
-    return SlotState(state.content, color, state.position, state.scale, presence), attention_BKHW
+    # A thing that has no peak may stand where it stood, beside a larger one: it keeps the votes nearest to it.
+    missing = np.setdiff1d(used, owner_P)
+    radius_M = (state.scale * state.scale.new_tensor([W / 2, H / 2])).norm(dim=-1)[missing]
+    center_M2 = (state.position[missing] + 1) * state.position.new_tensor([W / 2, H / 2]) - 0.5
+    known_M3 = torch.cat([center_M2, SIZE_UNIT * radius_M.log()[:, None]], 1)
+    votes_M = (torch.cdist(known_M3, ballot.votes_L3) < PEAK_RADIUS).sum(1)
+    there = (votes_M >= MIN_SHARE * _pixels_of(known_M3).clamp_min(MIN_AREA)).cpu().numpy()
+    candidates_C3 = torch.cat([ballot.peaks_P3, known_M3[there]])
+    owner_C = torch.as_tensor(np.concatenate([owner_P, missing[there]]), device=winner_L.device)
+    return owner_C[ballot.elect(candidates_C3)]
 
 
 class VotesParser(SceneParser):
@@ -313,12 +311,8 @@ class VotesParser(SceneParser):
         slots, attentions = [], []
         for frames_B3HW in frames_BT3HW.unbind(1):
             before = state
-            with torch.no_grad():
-                logits_B3HW, votes_B3HW = self.network(frames_B3HW)
-            most = state.color.shape[1] - 2
-            found = decode(logits_B3HW, votes_B3HW, most, self.config.min_votes)
-            state, attention_BKHW = hand_out(found, frames_B3HW, state, speed_BK2)
-            state, _ = self.corrector(frames_B3HW, state, attention_BKHW)
+            attention_BKHW = self._divide(frames_B3HW, state, speed_BK2)
+            state, _ = self.corrector(frames_B3HW, _greet(state, frames_B3HW, attention_BKHW), attention_BKHW)
             speed_BK2 = torch.where(before.is_thing, state.position - before.position, 0.0)
             slots.append(state.join())
             attentions.append(attention_BKHW)
@@ -329,6 +323,18 @@ class VotesParser(SceneParser):
         logits_N3HW, votes_N3HW = self.network(frames_N3HW)
         return vote_loss(logits_N3HW, votes_N3HW, vote_targets(labels_NHW))
 
+    @torch.no_grad()
+    def _divide(self, frames_B3HW: Tensor, state: SlotState, speed_BK2: Tensor) -> Tensor:
+        """What each slot covers (B, K, H, W), which sums to 1 over the slots."""
+        logits_B3HW, votes_B3HW = self.network(frames_B3HW)
+        B, K = state.presence.shape[:2]
+        slot_BHW = (logits_B3HW.argmax(1) == ROBOT).long()
+        for b in range(B):
+            ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - 2, self.config.min_votes)
+            one = SlotState(*(part[b].detach() for part in vars(state).values()))
+            slot_BHW[(b, *ballot.pixels)] = follow(ballot, frames_B3HW[b], one, speed_BK2[b].detach())
+        return F.one_hot(slot_BHW, K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
+
     def _nothing(self, frames_B3HW: Tensor, K: int) -> SlotState:
         """Slots before anything is seen: the canvas, which fills the frame, and unused ones in its middle."""
         B = len(frames_B3HW)
@@ -337,3 +343,13 @@ class VotesParser(SceneParser):
         place, size = frames_B3HW.new_zeros(B, K, 2), frames_B3HW.new_full((B, K, 2), 0.5)
         content = frames_B3HW.new_zeros(B, K, self.layout.content)
         return SlotState(content, frames_B3HW.new_full((B, K, 3), UNSEEN), place, size, presence)
+
+
+def _greet(state: SlotState, frames_B3HW: Tensor, attention_BKHW: Tensor) -> SlotState:
+    """The slots, those that cover something for the first time with its colour and presence."""
+    area_BK1 = attention_BKHW.sum((2, 3))[..., None]
+    mean_BK3 = attention_BKHW.flatten(2) @ frames_B3HW.flatten(2).transpose(1, 2) / area_BK1.clamp_min(1)
+    fresh_BK1 = (area_BK1 >= MIN_AREA) & (state.color == UNSEEN).all(-1, keepdim=True)
+    color = torch.where(fresh_BK1, mean_BK3, state.color)
+    presence = torch.where(fresh_BK1 & state.is_unused, PRESENCE_THING, state.presence)
+    return SlotState(state.content, color, state.position, state.scale, presence)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from tests.textocvp.conftest import VOTES, build
 from textocvp.config import ModelConfig
-from textocvp.parsers.votes import VotesConfig, VotesParser, decode, vote_loss, vote_targets
+from textocvp.parsers.votes import VotesConfig, VotesParser, count_votes, vote_loss, vote_targets
 from textocvp.slots import SlotState
 
 RED, BLUE, TABLE, ARM = (255, 87, 89), (78, 121, 167), (47, 47, 47), (120, 120, 120)
@@ -100,17 +100,13 @@ def test_the_network_moves_with_the_picture() -> None:
 )
 def test_touching_objects_are_told_apart_by_their_votes(boxes: tuple) -> None:
     labels = scene(*boxes, (4, 25, 25, 2, 2), (1, 0, 20, 5, 5))
-    found = decode(*perfect(labels), most=6)
-    masks = sorted(
-        (tuple(mask.flatten().nonzero()[:, 0].tolist()) for mask in found.masks_BPHW[0]),
-        key=lambda mask: (len(mask), mask),
-    )
-    expected = sorted(
-        (tuple((labels == i).flatten().nonzero()[:, 0].tolist()) for i in (2, 3, 4)),
-        key=lambda mask: (len(mask), mask),
-    )
-    assert masks == [(), (), (), *expected]
-    assert torch.equal(found.robot_BHW, labels == 1)
+    (logits,), (votes,) = perfect(labels)
+    ballot = count_votes(logits, votes, most=6)
+    assert len(ballot.peaks_P3) == 3
+    winner, truth = ballot.elect(ballot.peaks_P3), labels[0][ballot.pixels]
+    for label in (2, 3, 4):
+        assert len(winner[truth == label].unique()) == 1
+    assert len(winner.unique()) == 3
 
 
 def test_a_carried_object_keeps_its_slot_past_another_of_its_colour() -> None:
