@@ -187,12 +187,13 @@ class Ballot:
     """The votes of one frame's object pixels, and the objects that they elect.
 
     Attributes:
-        pixels: rows and columns of the L pixels.
+        y_L, x_L: rows and columns of the pixels.
         votes_L3: where they say that their object's centre is, (x, y) in pixels and its size.
         peaks_P3: where these are densest, the densest first.
     """
 
-    pixels: tuple[Tensor, Tensor]
+    y_L: Tensor
+    x_L: Tensor
     votes_L3: Tensor
     peaks_P3: Tensor
 
@@ -222,7 +223,7 @@ def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: flo
     while len(peaks) < most and len(some_S3) and density_S.max() > 0:
         peaks.append(int(density_S.argmax()))
         density_S = density_S.masked_fill(near_SS[peaks[-1]] < PEAK_RADIUS, 0.0)
-    return Ballot((y_L, x_L), votes_L3, some_S3[peaks])
+    return Ballot(y_L, x_L, votes_L3, some_S3[peaks])
 
 
 def _pixels_of(votes_N3: Tensor) -> Tensor:
@@ -240,10 +241,10 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     """
     (H, W), P = frame_3HW.shape[1:], len(ballot.peaks_P3)
     if P == 0:
-        return torch.zeros_like(ballot.pixels[0])
+        return torch.zeros_like(ballot.y_L)
     winner_L = ballot.elect(ballot.peaks_P3)
     masks_PHW = frame_3HW.new_zeros(P, H, W)
-    masks_PHW[(winner_L, *ballot.pixels)] = 1
+    masks_PHW[winner_L, ballot.y_L, ballot.x_L] = 1
     position_P2, scale_P2 = (values[0] for values in moments(masks_PHW[None]))
     mass_P1 = masks_PHW.sum((1, 2))[:, None].clamp_min(1)
     hue_P4 = color_features(masks_PHW.flatten(1) @ frame_3HW.flatten(1).T / mass_P1)
@@ -332,7 +333,8 @@ class VotesParser(SceneParser):
         for b in range(B):
             ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - 2, self.config.min_votes)
             one = SlotState(*(part[b].detach() for part in vars(state).values()))
-            slot_BHW[(b, *ballot.pixels)] = follow(ballot, frames_B3HW[b], one, speed_BK2[b].detach())
+            slots_L = follow(ballot, frames_B3HW[b], one, speed_BK2[b].detach())
+            slot_BHW[b, ballot.y_L, ballot.x_L] = slots_L
         return F.one_hot(slot_BHW, K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
 
     def _nothing(self, frames_B3HW: Tensor, K: int) -> SlotState:

@@ -103,7 +103,7 @@ def test_touching_objects_are_told_apart_by_their_votes(boxes: tuple) -> None:
     (logits,), (votes,) = perfect(labels)
     ballot = count_votes(logits, votes, most=6)
     assert len(ballot.peaks_P3) == 3
-    winner, truth = ballot.elect(ballot.peaks_P3), labels[0][ballot.pixels]
+    winner, truth = ballot.elect(ballot.peaks_P3), labels[0][ballot.y_L, ballot.x_L]
     for label in (2, 3, 4):
         assert len(winner[truth == label].unique()) == 1
     assert len(winner.unique()) == 3
