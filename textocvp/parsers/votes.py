@@ -41,7 +41,11 @@ UNSEEN = 0.0  # colour of a slot that holds nothing yet
 # What it costs to take a thing for that of a slot: log(1 + d^2), d its distance in units of three times the slot's size
 # and SEARCH together, and its differences in colour and log-size.
 SEARCH = 0.08
-COLOR_COST, SIZE_COST, NEW_COST, MOST_COST = 4.0, 0.5, 1.5, 6.0
+COLOR_COST, SIZE_COST = 4.0, 0.7
+MOST_COST, PIECE_COST = (
+    2.5,
+    1.2,
+)  # up to which a thing is that of a slot, and what nobody has is a piece of it
 
 
 @dataclass(frozen=True)
@@ -262,7 +266,7 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     owner_P[columns[sure]] = used[rows[sure]]
     # What is left is a piece of a thing that fell apart, or it is new.
     rest = np.flatnonzero(owner_P == 0)
-    pieces = cost_UP[:, rest].min(0, initial=MOST_COST) < NEW_COST
+    pieces = cost_UP[:, rest].min(0, initial=MOST_COST) < PIECE_COST
     if pieces.any():
         owner_P[rest[pieces]] = used[cost_UP[:, rest[pieces]].argmin(0)]
     new = rest[~pieces][: len(free)]
