@@ -8,6 +8,7 @@ from textocvp.config import ModelConfig
 from textocvp.parsers.holistic import HolisticConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.parsers.savi import SaviConfig
+from textocvp.parsers.votes import VotesConfig
 from textocvp.predictors.ocvp_seq import OCVPSeqConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers.broadcast import BroadcastConfig
@@ -82,10 +83,24 @@ NON_OC = ModelConfig(
     text=PUBLISHED_TEXT,
     predictor=PUBLISHED,
 )
+# CLIPort's scene at half its size, on CPUs.
+CLIPORT_VOTES = replace(
+    TABLETOP_SMALL, name="cliport-votes", parser=VotesConfig(image_size=168, num_slots=12)
+)
 OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
 OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
 
-_ALL = TABLETOP_SMALL, SAVI_SMALL, SAVI_CATER, CLIPORT_DINO, OCVP_SEQ_SMALL, OCVP_SEQ, NON_OC_SMALL, NON_OC
+_ALL = (
+    TABLETOP_SMALL,
+    SAVI_SMALL,
+    SAVI_CATER,
+    CLIPORT_DINO,
+    CLIPORT_VOTES,
+    OCVP_SEQ_SMALL,
+    OCVP_SEQ,
+    NON_OC_SMALL,
+    NON_OC,
+)
 PRESETS = {one.name: one for one in _ALL}
 
 # What `textocvp models` says of each preset and bundled checkpoint.
@@ -95,6 +110,7 @@ DESCRIPTIONS = {
     "savi-small": "TextOCVP with published slots, small, for ablations of the parser",
     "savi-cater": "TextOCVP-SAVi at the paper's sizes (CATER)",
     "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
+    "cliport-votes": "TextOCVP with a parser that has learned to see, for CLIPort's scene at 168x168",
     "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
     "ocvp-seq": "OCVP-Seq, no text, at its published size",
     "non-oc-small": "Non-OC, one slot for the whole scene, small",

@@ -13,6 +13,7 @@ from textocvp.model import TextOCVP
 from textocvp.parsers.holistic import HolisticConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.parsers.savi import SaviConfig
+from textocvp.parsers.votes import VotesConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.presets import TABLETOP_COLORS, TABLETOP_WORDS
 from textocvp.renderers.broadcast import BroadcastConfig
@@ -31,6 +32,20 @@ PLACED = ModelConfig(
     text=SMALL_TEXT,
     predictor=TextOCVPConfig(
         dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, color_bias=True, feed_forwards=1
+    ),
+)
+
+VOTES = replace(
+    PLACED,
+    name="tiny-votes",
+    parser=VotesConfig(
+        image_size=32,
+        num_slots=6,
+        layout=SlotLayout(content=8),
+        hidden=16,
+        crop_cells=8,
+        channels=4,
+        channels_full=4,
     ),
 )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, build
+from tests.textocvp.conftest import NON_OC, PLACED, PUBLISHED, VOTES, build
 from textocvp import WorldModel
 from textocvp.config import ModelConfig, with_settings
 
@@ -43,7 +43,7 @@ def test_placed_slots_find_as_many_things_as_there_are_slots() -> None:
     torch.testing.assert_close(raised.frames, trained.frames, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("config", [PLACED, PUBLISHED, CLUSTERS], ids=lambda config: config.name)
+@pytest.mark.parametrize("config", [PLACED, PUBLISHED, CLUSTERS, VOTES], ids=lambda config: config.name)
 @pytest.mark.parametrize("kind", ["textocvp", "ocvp-seq"])
 def test_every_slot_model_takes_more_slots_and_fewer(config: ModelConfig, kind: str) -> None:
     world_model = WorldModel(build(with_settings(config, [f"predictor.kind={kind}"])))

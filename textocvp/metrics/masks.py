@@ -59,24 +59,29 @@ class ObjectMatches:
     ious: np.ndarray  # (N,), intersection over union of the two; 0 if there is no slot
 
 
-def overlaps(masks: Any, segmentation: np.ndarray, objects: Collection[int]) -> Arrays:
+def overlaps(
+    masks: Any, segmentation: np.ndarray, objects: Collection[int], *, min_pixels: int | None = None
+) -> Arrays:
     """Intersection over union of every slot with every visible object.
 
     Args:
-        objects: labels of the objects that count; those of fewer than `MIN_PIXELS` pixels are not visible.
+        objects: labels of the objects that count.
+        min_pixels: those of fewer pixels are not visible; `MIN_PIXELS` by default.
 
     Returns:
         ious (S, N), the S slots that win a pixel, the labels of the N objects, both ascending.
     """
     counts, slots, ids = _contingency(*_same_pixels(masks, segmentation))
     unions = counts.sum(axis=1, keepdims=True) + counts.sum(axis=0, keepdims=True) - counts
-    seen = np.isin(ids, list(objects)) & (counts.sum(axis=0) >= MIN_PIXELS)
+    seen = np.isin(ids, list(objects)) & (counts.sum(axis=0) >= (min_pixels or MIN_PIXELS))
     return (counts / unions)[:, seen], slots, ids[seen]
 
 
-def object_ious(masks: Any, segmentation: np.ndarray, objects: Collection[int]) -> ObjectMatches:
+def object_ious(
+    masks: Any, segmentation: np.ndarray, objects: Collection[int], *, min_pixels: int | None = None
+) -> ObjectMatches:
     """Match slots to the visible objects of one frame (Hungarian algorithm). Arguments as `overlaps`."""
-    ious, slots, ids = overlaps(masks, segmentation, objects)
+    ious, slots, ids = overlaps(masks, segmentation, objects, min_pixels=min_pixels)
     rows, columns = linear_sum_assignment(-ious)
     matched = ObjectMatches(ids, np.full(len(ids), -1), np.zeros(len(ids)))
     matched.slots[columns] = slots[rows]

@@ -59,9 +59,10 @@ class Parsed:
 
 
 class SceneParser(nn.Module):
-    """Frames to slots. Subclasses set `Config` and write `forward`."""
+    """Frames to slots. Subclasses set `Config` and write `forward`; one that is `taught` also `lesson_loss`."""
 
     Config: ClassVar[type[ParserConfig]]
+    taught: ClassVar[bool] = False
     config: ParserConfig
 
     def __init__(self, config: ParserConfig) -> None:
@@ -84,6 +85,14 @@ class SceneParser(nn.Module):
             num_slots: how many slots to use, background included; the configured number by default.
             generator: where initial slots are drawn from, on the frames' device; PyTorch's own by default. Or one for
                 each clip, on any device: a clip's slots then do not depend on its neighbours.
+        """
+        raise NotImplementedError
+
+    def lesson_loss(self, frames_N3HW: Tensor, labels_NHW: Tensor) -> Tensor:
+        """What a parser that is taught gets wrong of single frames, a mean over them.
+
+        Args:
+            labels_NHW: 0 background, 1 robot, and one other number for each object of a frame.
         """
         raise NotImplementedError
 

@@ -26,18 +26,27 @@ from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
 
 
 @dataclass(frozen=True)
-class PlacedConfig(ParserConfig):
-    """Options of `PlacedParser`."""
+class CropConfig(ParserConfig):
+    """Options of `PlacedCorrector`."""
 
-    kind: Literal["placed"] = "placed"
     crop_cells: int = 24  # side in cells of the canonical picture in which the corrector reads a slot
     crop_extent: float = 2.6  # how many standard deviations that picture reaches to each side
     hidden: int = 256  # width of the corrector's fully connected layers
+
+    def __post_init__(self) -> None:
+        self._check_layout(explicit=True)
+
+
+@dataclass(frozen=True)
+class PlacedConfig(CropConfig):
+    """Options of `PlacedParser`."""
+
+    kind: Literal["placed"] = "placed"
     transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128
 
     def __post_init__(self) -> None:
-        self._check_layout(explicit=True)
+        super().__post_init__()
         self._check_heads(2 * self.layout.content, self.transition_heads)
 
 
@@ -79,7 +88,7 @@ class PlacedCorrector(nn.Module):
 
     min_pixels = 3.0  # a slot that gets less than this is hidden; it keeps what it had
 
-    def __init__(self, config: PlacedConfig) -> None:
+    def __init__(self, config: CropConfig) -> None:
         super().__init__()
         content = config.layout.content
         self.cells, self.extent = config.crop_cells, config.crop_extent

@@ -17,7 +17,9 @@ from textocvp.data.episodes import Episodes
 from textocvp.data.prefetch import prefetch
 from textocvp.parsers.base import to_frames
 from textocvp.parsers.dino import DinoEncoder
+from textocvp.training.light import relight
 from textocvp.training.run import Run, SettingsError, TrainingSettings, step_rng
+from textocvp.training.teacher import Teacher
 
 
 @dataclass(kw_only=True)
@@ -45,17 +47,27 @@ class Clips:
     Attributes:
         frames_BTHW3: uint8.
         seeds_B: one for each clip, for parsers that draw their first slots.
-        features_BTLF: of the frozen encoder, float16; None where they are not cached.
+        features_BTLF: of the frozen encoder, float16, where they are cached.
+        lit_BTHW3: the same frames under other light, uint8, and
+        labels_BTHW: what their pixels show, for parsers that are taught.
     """
 
     frames_BTHW3: Tensor
     seeds_B: Tensor
     features_BTLF: Tensor | None = None
+    lit_BTHW3: Tensor | None = None
+    labels_BTHW: Tensor | None = None
 
     def on(self, device: torch.device) -> tuple[Tensor, Tensor | None]:
         """Frames (B, T, 3, H, W) in -1..1 and features (B, T, L, F), both float32."""
         features = self.features_BTLF
         return to_frames(self.frames_BTHW3, device), None if features is None else features.to(device).float()
+
+    def lesson(self, device: torch.device) -> tuple[Tensor, Tensor] | None:
+        """Frames (B, T, 3, H, W) in -1..1 under other light and their labels (B, T, H, W), where there are any."""
+        if self.lit_BTHW3 is None or self.labels_BTHW is None:
+            return None
+        return to_frames(self.lit_BTHW3, device), self.labels_BTHW.to(device)
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,7 @@ class ClipReader:
     args: ClipTraining
     rows: slice
     features: FrameCache | None = None
+    teacher: Teacher | None = None
 
     def __call__(self, step: int) -> Clips:
         args, rng = self.args, step_rng(self.args.seed, step)
@@ -77,6 +90,16 @@ class ClipReader:
         clips = Clips(torch.from_numpy(frames[:, ::stride].copy()), torch.from_numpy(seeds_B))
         if self.features is not None:
             clips.features_BTLF = torch.from_numpy(self.features.clips(starts, length, stride))
+        if self.teacher is not None:
+            labels = self.teacher.labels(starts, frames[:, ::stride], stride)
+            seeds = rng.integers(2**63, size=args.batch)[self.rows]
+            lit, seen = zip(
+                *map(relight, frames[:, ::stride], labels, map(np.random.default_rng, seeds)), strict=True
+            )
+            clips.lit_BTHW3, clips.labels_BTHW = (
+                torch.from_numpy(np.stack(lit)),
+                torch.from_numpy(np.stack(seen)),
+            )
         return clips
 
     def steps(self, run: Run, name: str) -> Iterator[tuple[int, Clips]]:
@@ -85,7 +108,13 @@ class ClipReader:
         return zip(run.steps(name), batches, strict=True)
 
 
-def clip_reader(run: Run, args: ClipTraining, episodes: Episodes, encoder: DinoEncoder | None) -> ClipReader:
+def clip_reader(
+    run: Run,
+    args: ClipTraining,
+    episodes: Episodes,
+    encoder: DinoEncoder | None,
+    teacher: Teacher | None = None,
+) -> ClipReader:
     """A reader of this process's clips; with `args.cache_features` the features of all episodes are computed first.
 
     Raises:
@@ -108,7 +137,7 @@ def clip_reader(run: Run, args: ClipTraining, episodes: Episodes, encoder: DinoE
         share = (run.accelerator.process_index, run.accelerator.num_processes)
         features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)
         run.accelerator.wait_for_everyone()
-    return ClipReader(episodes, args, run.rows, features)
+    return ClipReader(episodes, args, run.rows, features, teacher)
 
 
 def save_samples(

@@ -5,15 +5,17 @@ Masks are used for measuring only; nothing here is ever trained on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from textocvp.data.episodes import Episodes
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
+from textocvp.metrics.masks import MIN_PIXELS
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.training.run import Metrics
@@ -35,6 +37,7 @@ class ParserMetrics(Metrics):
         followed: share of the first frame's objects whose slot keeps them through the whole episode.
         foreground_ari: adjusted Rand index without the background's pixels, the robot included.
         psnr: of the redrawn frames, dB.
+        robot: IoU of the robot with the slot that covers it best.
         left_out: why all but the PSNR are None; empty where they are not.
     """
 
@@ -45,6 +48,7 @@ class ParserMetrics(Metrics):
     followed: Interval | None
     foreground_ari: Interval | None
     psnr: Interval
+    robot: Interval | None = None
     left_out: str = ""
 
     def __str__(self) -> str:
@@ -63,21 +67,32 @@ class ParserMetrics(Metrics):
 
 @torch.no_grad()
 def measure_parser(
-    model: TextOCVP, episodes: Episodes, chosen: Iterable[int], *, frame_step: int = 3
+    model: TextOCVP,
+    episodes: Episodes,
+    chosen: Iterable[int],
+    *,
+    frame_step: int = 3,
+    min_pixels: int = MIN_PIXELS,
+    drawn_masks: bool = True,
+    change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] = lambda frames_THW3: frames_THW3,
 ) -> ParserMetrics:
-    """Parse whole episodes and compare the drawn masks with the true ones.
+    """Parse whole episodes and compare masks with the true ones.
 
     Args:
         chosen: numbers of held-out episodes.
         frame_step: IoU, ARI and PSNR are taken at every `frame_step`-th frame; following always at every frame.
+        min_pixels: objects with fewer visible pixels are left out of IoUs.
+        drawn_masks: compare the masks that the renderer draws, or those of a parser that attends to pixels.
+        change: what is done to the frames (T, H, W, 3), for example other light.
     """
-    ious, found, follows, aris, psnrs = [], [], [], [], []
+    ious, found, follows, aris, psnrs, robots = [], [], [], [], [], []
     left_out = NO_MASKS
     for index in chosen:
-        frames = to_frames(episodes.frames(index)[None], model.device)[0]
+        frames = to_frames(change(episodes.frames(index))[None], model.device)[0]
         # Where first slots are drawn, an episode's are the same whenever it is measured.
         seeded = torch.Generator(model.device).manual_seed(index)
-        slots = model.parser(frames[None], generator=seeded).slots_BTKD[0]
+        parsed = model.parser(frames[None], generator=seeded)
+        slots = parsed.slots_BTKD[0]
         rendered = model.renderer(slots)
         drawn = (rendered.frames_B3HW.clamp(-1, 1) + 1) / 2
         psnrs.append(psnr(drawn, (frames + 1) / 2).mean().item())
@@ -87,19 +102,33 @@ def measure_parser(
         truth = episodes.truth(index)
         if truth is None or truth.segmentation is None:
             continue
-        labels, segmentation = rendered.masks_BKHW.argmax(1).cpu().numpy(), truth.segmentation
+        masks = rendered.masks_BKHW if drawn_masks else parsed.attention_BTKHW[0]
+        labels = masks.argmax(1).cpu().numpy()
+        segmentation = truth.segmentation
         # All that is neither background nor robot is an object.
         objects = [label for label in np.unique(segmentation).tolist() if label not in (0, truth.robot)]
         times = range(0, len(labels), frame_step)
-        matches = np.concatenate([object_ious(labels[t], segmentation[t], objects).ious for t in times])
+        matches = _ious(labels[::frame_step], segmentation[::frame_step], objects, min_pixels)
         if len(matches) == 0:  # nothing but background
             continue
         ious.append(matches.mean())
         found.append((matches > 0.5).mean())
         follows.append(followed(labels, segmentation, objects).mean())
+        robot_only = [] if truth.robot is None else [truth.robot]
+        covered = _ious(labels[::frame_step], segmentation[::frame_step], robot_only, min_pixels)
+        if len(covered):
+            robots.append(covered.mean())
         aris.append(np.mean([foreground_ari(labels[t], segmentation[t]) for t in times]))
-    miou, share, kept, ari = (
+    miou, share, kept, ari, robot = (
         bootstrap_interval(values) if not np.isnan(values).all() else None
-        for values in (ious, found, follows, aris)
+        for values in (ious, found, follows, aris, robots)
     )
-    return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs), "" if ious else left_out)
+    return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs), robot, "" if ious else left_out)
+
+
+def _ious(
+    labels_THW: NDArray[np.int64], segmentation_THW: NDArray[np.uint8], wanted: list[int], min_pixels: int
+) -> NDArray[np.float64]:
+    """IoUs of what has these labels in the segmentation, all frames' one after another."""
+    pairs = zip(labels_THW, segmentation_THW, strict=True)
+    return np.concatenate([object_ious(*pair, wanted, min_pixels=min_pixels).ious for pair in pairs])

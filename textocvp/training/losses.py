@@ -26,18 +26,19 @@ class ParserLoss:
         mask: `mask_loss`.
         place: `place_loss`; for slots without explicit places `read_place_loss`.
         feature: mean squared error of the reconstructed features.
+        lesson: what a parser that is taught gets wrong.
     """
 
     image: Tensor
     mask: Tensor
     place: Tensor
     feature: Tensor
+    lesson: Tensor
 
     def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
-        return (
-            self.image + mask_weight * self.mask + place_weight * self.place + feature_weight * self.feature
-        )
+        learned = self.image + mask_weight * self.mask + place_weight * self.place
+        return learned + feature_weight * self.feature + self.lesson
 
 
 def thing_weights(target: Tensor, thing_weight: float) -> Tensor:

@@ -3,7 +3,8 @@
     textocvp train parser --data data/tabletop-train.h5 --val data/tabletop-val.h5 --out runs/parser
 
 No label is used: the loss compares the drawn frame with the frame, the drawn masks with the parser's own attention,
-and the places that the transition expected with those that the corrector found.
+and the places that the transition expected with those that the corrector found. A parser that is taught (`votes`)
+learns from masks that the videos give of themselves, or from those of the simulator (`--teacher masks`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -34,7 +36,8 @@ from textocvp.training.losses import (
     read_place_loss,
     thing_weights,
 )
-from textocvp.training.run import Run, allowed_settings, close_run, open_data, open_run
+from textocvp.training.run import Run, SettingsError, allowed_settings, close_run, open_data, open_run
+from textocvp.training.teacher import Teacher
 
 
 @dataclass(kw_only=True)
@@ -53,6 +56,10 @@ class ParserTraining(ClipTraining):
     """Weight of the transition's error in place, or of the error of the places that the renderer reads."""
     feature_weight: float = 1.0
     """Weight of the error of reconstructed features (renderer `features` only)."""
+    teacher: Literal["video", "masks"] = "video"
+    """Who says what pixels show (parser `votes` only): the videos themselves, or the masks of the episodes."""
+    first_redraw: int = 0
+    """Update at which the renderer begins to learn; before it, only a parser that is taught does."""
 
 
 class ParserStage(nn.Module):
@@ -71,6 +78,8 @@ class ParserStage(nn.Module):
         weight: float = 1.0,
         generator: Sequence[torch.Generator] | None = None,
         features_BTLF: Tensor | None = None,
+        lesson: tuple[Tensor, Tensor] | None = None,
+        redraw: bool = True,
     ) -> ParserLoss:
         """The terms of stage 1 for clips in -1..1, or what a micro-batch adds to those of the batch.
 
@@ -80,13 +89,21 @@ class ParserStage(nn.Module):
             weight: how much of the batch these clips are.
             generator: one for each clip, for parsers that draw their first slots.
             features_BTLF: of the parser's frozen encoder, where they are cached.
+            lesson: frames like `frames_BT3HW` and what their pixels show, for a parser that is taught.
+            redraw: whether there is anything to learn beside the lesson.
         """
+        zero = frames_BT3HW.new_zeros(())
+        taught = (
+            zero if lesson is None else weight * self.parser.lesson_loss(*(x.flatten(0, 1) for x in lesson))
+        )
+        if not redraw:
+            return ParserLoss(zero, zero, zero, zero, taught)
         known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
         parsed = self.parser(frames_BT3HW, generator=generator, **known)
         target = frames_BT3HW.flatten(0, 1)
         slots_NKD, attention_NKHW = parsed.slots_BTKD.flatten(0, 1), parsed.attention_BTKHW.flatten(0, 1)
         rendered = self.renderer(slots_NKD)
-        mask = place = feature = target.new_zeros(())
+        mask = place = feature = zero
         places = self.renderer.places(slots_NKD)
         if places is not None:
             place = read_place_loss(*places, attention_NKHW)
@@ -98,7 +115,7 @@ class ParserStage(nn.Module):
         if rendered.features_BLF is not None and parsed.features_BTLF is not None:
             feature = F.mse_loss(rendered.features_BLF, parsed.features_BTLF.flatten(0, 1))
         image = image_loss(rendered, target, weights_N1HW, whole)
-        return ParserLoss(image, mask, weight * place, weight * feature)
+        return ParserLoss(image, mask, weight * place, weight * feature, taught)
 
 
 def train(args: ParserTraining) -> ParserMetrics | None:
@@ -112,8 +129,9 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         WeightsError: if the weights of the parser's frozen encoder are missing.
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
-    single = args.clip == 1  # on single frames the transition takes no part
-    accelerator = open_run(args.out, args.precision, some_unused=single)
+    # On single frames the transition takes no part, and before the first redraw nothing but the lesson.
+    some_unused = args.clip == 1 or args.first_redraw > 0
+    accelerator = open_run(args.out, args.precision, some_unused=some_unused)
     torch.manual_seed(args.seed)
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
@@ -124,9 +142,13 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         def measure(count: int | None) -> ParserMetrics:
             return measure_parser(model, held_out, range(len(held_out))[:count])
 
-        reader = clip_reader(run, args, episodes, model.parser.dino)
+        if args.first_redraw and not model.parser.taught:
+            raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes")
+        teacher = Teacher(args.teacher, episodes) if model.parser.taught else None
+        reader = clip_reader(run, args, episodes, model.parser.dino, teacher)
         for step, clips in reader.steps(run, "parser"):
             frames_BT3HW, features_BTLF = clips.on(run.device)
+            lesson = clips.lesson(run.device)
             weights_BT1HW = thing_weights(frames_BT3HW, args.thing_weight)
             whole = run.total(weights_BT1HW.sum())
             for part in run.micro_batches():
@@ -138,6 +160,8 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                     weight=run.weight(part),
                     generator=generators,
                     features_BTLF=None if features_BTLF is None else features_BTLF[part],
+                    lesson=None if lesson is None else (lesson[0][part], lesson[1][part]),
+                    redraw=step >= args.first_redraw,
                 )
                 total = loss.total(args.mask_weight, args.place_weight, args.feature_weight)
                 run.backward(total, vars(loss))

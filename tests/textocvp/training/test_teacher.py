@@ -1,0 +1,101 @@
+"""Masks that videos give of themselves, and the changes of light under which they teach."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.textocvp.conftest import VOTES
+from tests.textocvp.toy_episodes import write_toy_episodes
+from tests.textocvp.training.runs import losses, parser_run, same_weights, train, train_killed_after
+from textocvp.data.episodes import EpisodeFile
+from textocvp.presets import PRESETS
+from textocvp.training.light import relight
+from textocvp.training.run import SettingsError
+from textocvp.training.teacher import Teacher, background_tones, video_masks
+
+FLOOR, TABLE, DARK, LIGHT = (200, 204, 198), (60, 58, 62), (30, 30, 34), (150, 150, 152)
+
+
+def painted() -> tuple[np.ndarray, np.ndarray]:
+    """A clip (6, 48, 48, 3) and its labels: an arm of two grays sweeps over two blocks in bowls and a gray block."""
+    labels = np.zeros((6, 48, 48), np.uint8)
+    frames = np.empty((6, 48, 48, 3), np.uint8)
+    frames[:, :24], frames[:, 24:] = FLOOR, TABLE
+    things = [(2, 28, 4, 12, (200, 60, 60)), (3, 32, 8, 4, (60, 90, 200)), (4, 28, 34, 6, (186, 176, 172))]
+    for label, top, left, side, color in things:
+        labels[:, top : top + side, left : left + side] = label
+        frames[:, top : top + side, left : left + side] = color
+    for t in range(6):
+        arm = np.s_[t, :30, 14 + 2 * t : 18 + 2 * t]
+        labels[arm], frames[arm] = 1, LIGHT
+        frames[t, 15:30, 14 + 2 * t : 18 + 2 * t] = DARK
+    return frames, labels
+
+
+def test_a_clean_video_gives_its_own_masks() -> None:
+    frames, labels = painted()
+    tones = background_tones(frames)
+    assert sorted(tones.tolist()) == sorted([list(map(float, FLOOR)), list(map(float, TABLE))])
+    found = video_masks(frames, tones)
+    for mine, truth in zip(found, labels, strict=True):
+        assert np.array_equal(mine == 0, truth == 0) and np.array_equal(mine == 1, truth == 1)
+        for label in (2, 3, 4):
+            number = np.unique(mine[truth == label])
+            assert len(number) == 1 and np.array_equal(mine == number, truth == label)
+
+
+@pytest.mark.parametrize("kind", ["video", "masks"])
+def test_labels_are_those_of_the_clips_frames(tmp_path: Path, kind: str) -> None:
+    with EpisodeFile(write_toy_episodes(tmp_path / "toy.h5", [9, 8])) as episodes:
+        frames, teacher = episodes.clips(np.array([2, 10]), 5), Teacher(kind, episodes)
+        labels = teacher.labels(np.array([2, 10]), frames[:, ::2], 2)
+        assert labels.shape == (2, 3, 32, 32)
+        if kind == "masks":
+            assert np.array_equal(labels[1], episodes.truth(1).segmentation[1:6:2])
+        again = teacher.labels(np.array([14]), frames[1:, 4:], 1)
+        assert np.array_equal(again[0, 0], labels[1, 2])
+
+
+def test_light_changes_pictures_and_moves_labels_with_them() -> None:
+    frames, labels = painted()
+    flips = 0
+    for seed in range(12):
+        lit, seen = relight(frames, labels, np.random.default_rng(seed))
+        again, _ = relight(frames, labels, np.random.default_rng(seed))
+        assert lit.dtype == np.uint8 and np.array_equal(lit, again)
+        mirrored = not np.array_equal(seen, labels)
+        assert np.array_equal(seen, labels[:, :, ::-1] if mirrored else labels)
+        flips += mirrored
+        # Whatever the light, the dark table stays darker than the light floor.
+        assert lit[:, :20][seen[:, :20] == 0].mean() > lit[:, 40:][seen[:, 40:] == 0].mean()
+    assert 0 < flips < 12
+
+
+@pytest.mark.parametrize("teacher", ["video", "masks"])
+def test_a_killed_run_continues_exactly(folder: Path, monkeypatch: pytest.MonkeyPatch, teacher: str) -> None:
+    monkeypatch.setitem(PRESETS, VOTES.name, VOTES)
+    settings = dict(preset=VOTES.name, steps=4, batch=3, clip=1, first_redraw=2, teacher=teacher)
+    straight, resumed, parts = (
+        parser_run(folder, name, **settings, **more)
+        for name, more in (("straight", {}), ("resumed", {}), ("parts", {"accumulate": 3}))
+    )
+    train(straight)
+    train_killed_after(resumed, 2)
+    train(resumed)
+    assert same_weights(straight.out, resumed.out)
+    train(parts)
+    assert losses(parts.out) == pytest.approx(losses(straight.out), rel=1e-3)
+
+
+def test_a_renderer_waits_only_for_a_parser_that_is_taught(folder: Path) -> None:
+    with pytest.raises(SettingsError, match="first_redraw is for parsers that are taught"):
+        train(parser_run(folder, "out", first_redraw=2))
+
+
+def test_a_teacher_without_masks_says_so(tmp_path: Path) -> None:
+    path = write_toy_episodes(tmp_path / "toy.h5", [9], truth=False)
+    with EpisodeFile(path) as episodes, pytest.raises(ValueError, match="has no masks to teach with"):
+        Teacher("masks", episodes).labels(np.array([0]), episodes.clips(np.array([0]), 1), 1)

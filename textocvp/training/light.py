@@ -1,0 +1,59 @@
+"""Other light on the same scene: what a parser that has learned to see must not be disturbed by."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+
+def relight(
+    clip_THW3: NDArray[np.uint8], labels_THW: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A clip under other light, of other colours, seen by a worse camera, perhaps mirrored; labels go along.
+
+    Brightness .65 to 1.35, a gradient of at most 35 %, gains and order of the colour channels, grain as of wood on
+    the background (label 0) or on everything, blur, noise of at most sigma 13 of 255, and JPEG.
+    """
+    H, W = labels_THW.shape[1:]
+    x = clip_THW3.astype(np.float32)
+    if rng.random() < 0.5:
+        x = x[..., rng.permutation(3)]
+    light_HW3 = rng.uniform(0.65, 1.35) * np.ones((H, W, 1)) * rng.uniform(0.88, 1.12, 3)
+    angle, strength = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.35) * (rng.random() < 0.6)
+    across_H, across_W = np.sin(angle) * np.linspace(-1, 1, H), np.cos(angle) * np.linspace(-1, 1, W)
+    light_HW3 *= 1 + strength * (across_H[:, None] + across_W)[..., None]
+    x = x * light_HW3.astype(np.float32)
+    if rng.random() < 0.35:
+        grain_HW1 = _grain(H, W, rng)[..., None] * rng.uniform(0.02, 0.15)
+        where = (labels_THW == 0)[..., None] if rng.random() < 0.6 else True
+        x = x * (1 + np.where(where, grain_HW1, 0)).astype(np.float32)
+    if rng.random() < 0.25:
+        x = ndimage.uniform_filter(x, (0, 3, 3, 0))
+    if rng.random() < 0.6:
+        x = x + rng.uniform(0, 13) * rng.standard_normal(x.shape, np.float32)
+    lit = x.round().clip(0, 255).astype(np.uint8)
+    if rng.random() < 0.2:
+        lit = np.stack([_jpeg(picture, int(rng.integers(50, 95))) for picture in lit])
+    if rng.random() < 0.5:
+        lit, labels_THW = lit[:, :, ::-1], labels_THW[:, :, ::-1]
+    return np.ascontiguousarray(lit), np.ascontiguousarray(labels_THW)
+
+
+def _grain(height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Streaks along one axis, of mean 0 and deviation about 1."""
+    few, many = int(rng.integers(2, 8)), int(rng.integers(20, 84))
+    sizes = (few, many) if rng.random() < 0.5 else (many, few)
+    coarse = rng.standard_normal(sizes)
+    return ndimage.zoom(
+        coarse, (height / sizes[0], width / sizes[1]), order=1, grid_mode=True, mode="nearest"
+    )
+
+
+def _jpeg(picture_HW3: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    file = io.BytesIO()
+    Image.fromarray(picture_HW3).save(file, "jpeg", quality=quality)
+    return np.asarray(Image.open(file))

@@ -1,0 +1,126 @@
+"""Masks that a video gives of itself, for a parser that learns to see: no simulator, no labels.
+
+The camera stands still, so the median of an episode's frames shows the scene without what moves, and its commonest
+colours are those of floor and table. What has none of them is foreground; gray parts of it that reach into the upper
+third are the robot, and connected parts of one hue are objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from textocvp.data.episodes import Episodes
+
+Labels = NDArray[np.uint8]
+
+TONE_SHARE = 0.06  # of the picture: a colour as common as this is background
+TONE_RADIUS = 4  # of 255, in each channel: clean videos have flat floors
+GRAY = 26  # of 255: difference between channels up to which a pixel is gray
+SAME_HUE = 0.035  # difference of chroma between neighbours up to which they are one thing
+MIN_PIXELS = 4
+
+
+@dataclass
+class Teacher:
+    """Says what the pixels of clips show: 0 background, 1 robot, 2 and more one for each object.
+
+    Attributes:
+        kind: `video` takes masks from the video itself, `masks` those that come with the episodes.
+        episodes: where the clips are from.
+    """
+
+    kind: Literal["video", "masks"]
+    episodes: Episodes
+    _tones: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+
+    def labels(self, starts: NDArray[np.int64], frames_BTHW3: NDArray[np.uint8], stride: int) -> Labels:
+        """Labels (B, T, H, W) of clips of every `stride`-th frame from these starts on.
+
+        Raises:
+            ValueError: if the episodes have no masks.
+        """
+        numbers = np.searchsorted(self.episodes.starts, starts, side="right") - 1
+        found = []
+        for index, start, frames_THW3 in zip(numbers.tolist(), starts, frames_BTHW3, strict=True):
+            if self.kind == "masks":
+                first = start - self.episodes.starts[index]
+                found.append(self._given(index)[first:][: len(frames_THW3) * stride : stride])
+                continue
+            if index not in self._tones:
+                self._tones[index] = background_tones(self.episodes.frames(index))
+            found.append(video_masks(frames_THW3, self._tones[index]))
+        return np.stack(found)
+
+    def _given(self, index: int) -> Labels:
+        truth = self.episodes.truth(index)
+        if truth is None or truth.segmentation is None:
+            raise ValueError(f"{self.episodes.path} has no masks to teach with: use --teacher video")
+        robot, labels = truth.segmentation == truth.robot, truth.segmentation
+        return np.where(robot, 1, labels + ((labels > 0) & (truth.robot != 1))).astype(np.uint8)
+
+
+def background_tones(frames_THW3: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The commonest colours (N, 3) of the median frame, at least one."""
+    left = np.median(frames_THW3, axis=0).reshape(-1, 3).astype(np.float32)
+    total = len(left)
+    tones: list[NDArray[np.float32]] = []
+    while len(left):
+        values, counts = np.unique((left // 4).astype(int) @ [1, 64, 4096], return_counts=True)
+        near = (left // 4).astype(int) @ [1, 64, 4096] == values[counts.argmax()]
+        tone = np.median(left[near], axis=0)
+        inside = np.abs(left - tone).max(-1) <= TONE_RADIUS
+        if tones and inside.sum() < TONE_SHARE * total:
+            break
+        tones.append(tone)
+        left = left[~inside]
+    return np.array(tones, np.float32)
+
+
+def video_masks(frames_NHW3: NDArray[np.uint8], tones_K3: NDArray[np.float32]) -> Labels:
+    """Labels (N, H, W) of frames: 0 background, 1 robot, 2 and more one for each object of a frame."""
+    return np.stack([_frame_masks(frame.astype(np.float32), tones_K3) for frame in frames_NHW3])
+
+
+def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) -> Labels:
+    away_HW = np.abs(frame_HW3[:, :, None] - tones_K3).max(-1).min(-1)
+    # Where floor and table meet there is a line of mixed colours, one or two pixels thick.
+    solid = ndimage.binary_opening(away_HW > TONE_RADIUS, np.ones((2, 2)))
+    labels = np.zeros(solid.shape, np.uint8)
+    gray = solid & (np.ptp(frame_HW3, axis=-1) <= GRAY)
+    parts, _ = ndimage.label(gray)
+    high = np.unique(parts[: len(parts) // 3])
+    labels[np.isin(parts, high[high > 0])] = 1
+    things = _parts_of_one_hue(frame_HW3, solid & (labels == 0))
+    for number, part in enumerate(np.unique(things[things > 0])[:250]):
+        labels[things == part] = 2 + number
+    return labels
+
+
+def _parts_of_one_hue(frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Connected parts, each with a number above 0."""
+    chroma_HW3 = frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
+    count = int(inside_HW.sum())
+    number = np.zeros(inside_HW.shape, int)
+    number[inside_HW] = np.arange(count)
+    ends: tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]] = [], []
+    for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        linked = inside_HW[a] & inside_HW[b]
+        close = np.abs(chroma_HW3[a][linked] - chroma_HW3[b][linked]).max(-1) <= SAME_HUE
+        ends[0].append(number[a][linked][close])
+        ends[1].append(number[b][linked][close])
+    one, other = map(np.concatenate, ends)
+    graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(count, count))
+    parts_N = connected_components(graph, directed=False)[1] + 1
+    parts_N[np.bincount(parts_N)[parts_N] < MIN_PIXELS] = 0
+    parts_HW = np.zeros(inside_HW.shape, int)
+    parts_HW[inside_HW] = parts_N
+    # Pixels of mixed colours between things go to the nearest part.
+    nearest = ndimage.distance_transform_edt(parts_HW == 0, return_distances=False, return_indices=True)
+    return np.where(inside_HW, parts_HW[tuple(nearest)], 0) if parts_N.any() else parts_HW
