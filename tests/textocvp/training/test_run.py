@@ -86,15 +86,21 @@ def test_workers_read_the_steps_in_their_order(folder: Path) -> None:
 def test_workers_outlive_the_signal_that_ends_a_run(folder: Path) -> None:
     """A cluster sends it to whole process groups, and without workers the last update could not be finished."""
     args = parser_run(folder, "out")
+    before = set(
+        multiprocessing.active_children()
+    )  # what other tests left running is none of this one's business
     with EpisodeFile(args.data) as episodes:
         batches = iter(prefetch(ClipReader(episodes, args, slice(None)), range(40), 1))
         next(batches)
-        (worker,) = multiprocessing.active_children()
-        os.kill(worker.pid, signal.SIGTERM)
-        worker.join(timeout=1)
-        assert worker.is_alive() and len(list(batches)) == 39
-        worker.join(timeout=30)
-        assert not worker.is_alive()
+        (worker,) = set(multiprocessing.active_children()) - before
+        try:
+            os.kill(worker.pid, signal.SIGTERM)
+            worker.join(timeout=1)
+            assert worker.is_alive() and len(list(batches)) == 39
+            worker.join(timeout=30)
+            assert not worker.is_alive()
+        finally:  # pytest would wait for it for ever
+            worker.kill()
 
 
 def test_shares_of_the_clips_are_the_clips(folder: Path) -> None:
