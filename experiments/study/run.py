@@ -56,7 +56,7 @@ class StudyArgs:
     """A first look with few scenes, at most 3 minutes on 2 cores."""
     workers: int = 0
     """Processes; 0 for one a core. Changes no figure."""
-    model: tuple[str, ...] = ()
+    model: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=CHECKPOINT: measure this checkpoint (a folder or hub id) as the model of that row, as MAGE=runs/mage."""
 
     def __post_init__(self) -> None:

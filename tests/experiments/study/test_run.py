@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tyro
 
 from experiments.report.results import Results
 from experiments.study import run as running
@@ -197,3 +198,9 @@ def test_every_method_has_what_its_kind_needs() -> None:
         assert method.key == key and method.note
         assert bool(method.model) == bool(method.train)
         assert method.kind != "baseline" or method.model
+
+
+def test_several_models_are_given_as_the_command_says() -> None:
+    args = tyro.cli(StudyArgs, args=["--model", "MAGE=runs/mage", "--model", "OCVP-Seq=runs/seq"])
+    assert args.model == ("MAGE=runs/mage", "OCVP-Seq=runs/seq")
+    assert args.options() == ["--model MAGE=runs/mage", "--model OCVP-Seq=runs/seq", "--seed 0"]
