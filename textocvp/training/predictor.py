@@ -11,6 +11,7 @@ teacher forced in one pass: it learns from rollouts, and the gradient flows back
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -22,6 +22,7 @@ Labels = NDArray[np.uint8]
 
 TONE_SHARE = 0.06  # of the picture: a colour as common as this is background
 TONE_RADIUS = 4  # of 255, in each channel: clean videos have flat floors
+MIXED = 0.35  # share of a thing in the colour of a pixel up to which the pixel is background
 GRAY = 26  # of 255: difference between channels up to which a pixel is gray
 SAME_HUE = 0.035  # difference of chroma between neighbours up to which they are one thing
 MIN_PIXELS = 4
@@ -89,9 +90,11 @@ def video_masks(frames_NHW3: NDArray[np.uint8], tones_K3: NDArray[np.float32]) -
 
 
 def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) -> Labels:
-    away_HW = np.abs(frame_HW3[:, :, None] - tones_K3).max(-1).min(-1)
+    apart_HWK = np.abs(frame_HW3[:, :, None] - tones_K3).max(-1)
     # Where floor and table meet there is a line of mixed colours, one or two pixels thick.
-    solid = ndimage.binary_opening(away_HW > TONE_RADIUS, np.ones((2, 2)))
+    solid = ndimage.binary_opening(apart_HWK.min(-1) > TONE_RADIUS, np.ones((2, 2)))
+    border = solid & ~ndimage.binary_erosion(solid, border_value=1)
+    solid &= ~(border & _mostly(tones_K3[apart_HWK.argmin(-1)], frame_HW3))
     labels = np.zeros(solid.shape, np.uint8)
     gray = solid & (np.ptp(frame_HW3, axis=-1) <= GRAY)
     parts, _ = ndimage.label(gray)
@@ -101,6 +104,19 @@ def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) 
     for number, part in enumerate(np.unique(things[things > 0])[:250]):
         labels[things == part] = 2 + number
     return labels
+
+
+def _mostly(tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which pixels (H, W) are their tone with less than `MIXED` of a neighbour's colour in it."""
+    H, W, _ = frame_HW3.shape
+    around = np.pad(frame_HW3, ((1, 1), (1, 1), (0, 0)), "edge")
+    own_HW3, mostly_HW = frame_HW3 - tone_HW3, np.zeros((H, W), bool)
+    for dy, dx in np.ndindex(3, 3):
+        other_HW3 = around[dy : dy + H, dx : dx + W] - tone_HW3
+        share_HW = (own_HW3 * other_HW3).sum(-1) / np.square(other_HW3).sum(-1).clip(1)
+        rest_HW = np.abs(own_HW3 - share_HW[..., None] * other_HW3).max(-1)
+        mostly_HW |= (share_HW > 0) & (share_HW < MIXED) & (rest_HW <= 2 * TONE_RADIUS)
+    return mostly_HW
 
 
 def _parts_of_one_hue(frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,16 @@ def test_a_checkpoint_knows_how_far_it_was_trained(folder: Path) -> None:
         )
     train(args)
     assert TextOCVP.from_pretrained(args.out / "checkpoint").config.stage == "predictor"
+
+
+def test_episodes_longer_than_the_window_are_not_cut_without_a_word(folder: Path) -> None:
+    with pytest.warns(
+        UserWarning, match=r"nothing is learned after frame 5, the longest has \d+; --set predictor"
+    ):
+        train(run(folder, PLACED, "short", steps=1, set=("predictor.window=4",)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        train(run(folder, PLACED, "long", steps=1, set=("predictor.window=30",)))
 
 
 def test_settings_that_do_not_fit_are_said_before_anything_is_parsed(folder: Path) -> None:

@@ -16,7 +16,7 @@ from textocvp.training.light import relight
 from textocvp.training.run import SettingsError
 from textocvp.training.teacher import Teacher, background_tones, video_masks
 
-FLOOR, TABLE, DARK, LIGHT = (200, 204, 198), (60, 58, 62), (30, 30, 34), (150, 150, 152)
+FLOOR, TABLE, DARK, LIGHT = (200, 204, 198), (60, 58, 62), (30, 30, 34), (110, 110, 112)
 
 
 def painted() -> tuple[np.ndarray, np.ndarray]:
@@ -45,6 +45,19 @@ def test_a_clean_video_gives_its_own_masks() -> None:
         for label in (2, 3, 4):
             number = np.unique(mine[truth == label])
             assert len(number) == 1 and np.array_equal(mine == number, truth == label)
+
+
+def test_mixed_colours_at_a_border_belong_to_what_they_are_mostly() -> None:
+    frames, labels = painted()
+    tones = background_tones(frames)
+    # A row of pixels above the upper block in a bowl shows a fifth of it, the row below it four fifths.
+    block = np.array((200, 60, 60), float)
+    for row, share in ((27, 0.2), (40, 0.8)):
+        frames[0, row, 4:13] = share * block + (1 - share) * np.array(TABLE, float)
+    found = video_masks(frames[:1], tones)[0]
+    assert np.array_equal(found[27, 4:13] > 0, np.zeros(9, bool))
+    assert np.array_equal(found[40, 5:12] == found[38, 10], np.ones(7, bool))
+    assert np.array_equal(found[28:40] > 0, labels[0, 28:40] > 0)
 
 
 @pytest.mark.parametrize("kind", ["video", "masks"])
