@@ -145,7 +145,16 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
         val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
         accelerator.wait_for_everyone()
         # One frame more than the past, so that every time code gets trained.
-        frames = model.config.predictor.window + 1 if causal else int(slots.lengths.max())
+        longest = int(max(slots.lengths.max(), val_slots.lengths.max()))
+        frames = model.config.predictor.window + 1 if causal else longest
+        if longest > frames and accelerator.is_main_process:
+            warnings.warn(
+                f"{(slots.lengths > frames).mean():.0%} of the episodes of {args.data} are longer than the "
+                f"predictor's window, and their ends are cut off: nothing is learned after frame {frames}, the "
+                f"longest has {longest}; --set predictor.window={longest - 1} takes all",
+                UserWarning,
+                stacklevel=2,
+            )
         batches = SlotBatches(slots, layout, model.text, frames)
         std_C = model.predictor.content_std_C if model.predictor.standardized else None
         if (
