@@ -31,10 +31,13 @@ REACH = 8.0  # pixels in which votes are written: an object's radius or so
 SIZE_UNIT = (
     12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
 )
+SMALLEST = (
+    14.3  # in that unit: smaller radii than this are alike, for a half hidden block is one block, not two
+)
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
 PEAK_RADIUS = 5.0  # pixels within which there is no second object
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
-MOST_VOTES = 2000  # of a frame that are compared with each other
+MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
 UNSEEN = 0.0  # colour of a slot that holds nothing yet
 
@@ -215,6 +218,7 @@ def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: flo
     """
     y_L, x_L = (logits_3HW.argmax(0) == OBJECT).nonzero(as_tuple=True)
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
+    votes_L3[:, 2].clamp_(min=SMALLEST)
     some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
     near_SS = torch.cdist(some_S3, some_S3)
     density_S = (
@@ -276,7 +280,7 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     missing = np.setdiff1d(used, owner_P)
     radius_M = (state.scale * state.scale.new_tensor([W / 2, H / 2])).norm(dim=-1)[missing]
     center_M2 = (state.position[missing] + 1) * state.position.new_tensor([W / 2, H / 2]) - 0.5
-    known_M3 = torch.cat([center_M2, SIZE_UNIT * radius_M.log()[:, None]], 1)
+    known_M3 = torch.cat([center_M2, (SIZE_UNIT * radius_M.log()).clamp_min(SMALLEST)[:, None]], 1)
     votes_M = (torch.cdist(known_M3, ballot.votes_L3) < PEAK_RADIUS).sum(1)
     there = (votes_M >= MIN_SHARE * _pixels_of(known_M3).clamp_min(MIN_AREA)).cpu().numpy()
     candidates_C3 = torch.cat([ballot.peaks_P3, known_M3[there]])

@@ -60,6 +60,9 @@ class ParserTraining(ClipTraining):
     """Who says what pixels show (parser `votes` only): the videos themselves, or the masks of the episodes."""
     first_redraw: int = 0
     """Update at which the renderer begins to learn; before it, only a parser that is taught does."""
+    taught: Path | None = None
+    """Checkpoint with a parser that has been taught, which sees as it did there: only what its slots hold, and the
+    renderer, are trained."""
 
 
 class ParserStage(nn.Module):
@@ -135,7 +138,10 @@ def train(args: ParserTraining) -> ParserMetrics | None:
     torch.manual_seed(args.seed)
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
-        model = TextOCVP(config).to(accelerator.device)
+        model = TextOCVP(config)
+    if args.taught is not None:
+        keep_taught(model, args.taught)
+    model.to(accelerator.device)
     run = Run(args, accelerator, ParserStage(model))
     with open_data(args, model.config.parser.image_size, "parser.image_size") as (episodes, held_out):
 
@@ -144,7 +150,8 @@ def train(args: ParserTraining) -> ParserMetrics | None:
 
         if args.first_redraw and not model.parser.taught:
             raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes")
-        teacher = Teacher(args.teacher, episodes) if model.parser.taught else None
+        learns = model.parser.taught and args.taught is None
+        teacher = Teacher(args.teacher, episodes) if learns else None
         reader = clip_reader(run, args, episodes, model.parser.dino, teacher)
         for step, clips in reader.steps(run, "parser"):
             frames_BT3HW, features_BTLF = clips.on(run.device)
@@ -172,6 +179,22 @@ def train(args: ParserTraining) -> ParserMetrics | None:
             print(f"not good enough to train a predictor on: {sentence}")
     close_run(accelerator)
     return metrics
+
+
+def keep_taught(model: TextOCVP, checkpoint: Path) -> None:
+    """Give the parser the network of a checkpoint's, and no gradient to it.
+
+    Raises:
+        SettingsError: if the parser is none that is taught, or its network has other sizes.
+    """
+    if not model.parser.taught:
+        raise SettingsError("taught is for parsers that are: set parser.kind=votes")
+    source = TextOCVP.from_pretrained(str(checkpoint)).parser
+    try:
+        model.parser.network.load_state_dict(source.network.state_dict())
+    except (AttributeError, RuntimeError) as error:
+        raise SettingsError(f"the parser of {checkpoint} has another network: {error}") from error
+    model.parser.network.requires_grad_(False)
 
 
 @torch.no_grad()
