@@ -217,13 +217,14 @@ class Subject:
         world_model, model = self.model, self.model.model
         if what.phase == "encode":
             return lambda: world_model.parse(images_BHW3[:, None])
-        seed_B1KD = world_model.parse(images_BHW3[:, None]).slots
+        parsed = world_model.parse(images_BHW3[:, None])
+        seed_B1KD = parsed.slots
         if what.phase == "predict":
             options = {"use_cache": self.cached}
             return lambda: model.predictor.rollout(seed_B1KD, model.text(texts), what.frames, **options)
         # Slots of the observation will do: what slots hold does not change what drawing them costs.
         slots_BTKD = seed_B1KD.expand(-1, what.frames, -1, -1)
-        rest = tuple(texts), world_model.image_size, model.parser.layout, model.renderer
+        rest = tuple(texts), parsed.image_size, model.parser.layout, model.renderer, None, parsed.seen
         return lambda: Rollout(slots_BTKD, *rest).frames
 
     def _codes(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Work:

@@ -30,6 +30,7 @@ from textocvp.checkpoint import (
 )
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
+from textocvp.inputs import times_larger
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
@@ -199,10 +200,10 @@ def _rollout(command: RolloutCommand) -> None:
     H, W = world_model.image_size
     if command.resize:
         picture = picture.resize((W, H), Image.Resampling.BOX)
-    elif picture.size != (W, H):
+    elif times_larger((picture.height, picture.width), (H, W)) == 0:
         raise Mistake(
             f"{command.image} is {picture.size[0]}x{picture.size[1]} pixels and the model was trained on "
-            f"{W}x{H}: take the picture at that size, or add --resize"
+            f"{W}x{H}: take the picture at that size or a whole multiple of it, or add --resize"
         )
     try:
         texts = (command.text, *command.more_texts)

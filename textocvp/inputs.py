@@ -33,12 +33,26 @@ def observed_images(obs: Mapping[str, Any] | np.ndarray) -> np.ndarray:
     return images
 
 
+def times_larger(size: tuple[int, int], image_size: tuple[int, int]) -> int:
+    """How many times larger pictures of `size` (H, W) are than `image_size`; 0 if no whole number of times."""
+    times = size[0] // image_size[0]
+    return times if size == (times * image_size[0], times * image_size[1]) else 0
+
+
 def checked_frames(
-    images: np.ndarray, image_size: tuple[int, int], device: torch.device, what: str = "the observation"
+    images: np.ndarray,
+    image_size: tuple[int, int],
+    device: torch.device,
+    what: str = "the observation",
+    *,
+    multiples: bool = False,
 ) -> Tensor:
     """Images (N, H, W, 3) uint8 as frames (N, 3, H, W) in -1..1.
 
-    `image_size` is the (H, W) that the model was trained on; messages call the images `what`.
+    Args:
+        image_size: the (H, W) that the model was trained on.
+        what: what messages call the images.
+        multiples: whether they may also be a whole number of times larger.
 
     Raises:
         TypeError: if they are not uint8.
@@ -53,10 +67,16 @@ def checked_frames(
         raise ValueError(
             f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}"
         )
-    if images.shape[1:3] != (H, W):
+    times = times_larger(images.shape[1:3], image_size)
+    if times == 0 or (times > 1 and not multiples):
+        allowed = (
+            f"it takes that and whole multiples of it, such as {2 * H}x{2 * W}"
+            if multiples
+            else "it takes no other"
+        )
         raise ValueError(
-            f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W} and no other "
-            "size: render or resize to that"
+            f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W}, {allowed}: "
+            "render or resize to that"
         )
     if images.max() == 1:
         raise ValueError(

@@ -24,9 +24,11 @@ from textocvp.checkpoint import (
 )
 from textocvp.config import ModelConfig
 from textocvp.parsers import build_parser
+from textocvp.parsers.votes import VotesConfig
 from textocvp.predictors import build_predictor
 from textocvp.renderers import build_renderer
-from textocvp.renderers.glimpse import GlimpseConfig
+from textocvp.renderers.carry import CarryConfig
+from textocvp.renderers.glimpse import PictureConfig
 from textocvp.renderers.patches import FeatureConfig, PatchConfig
 from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.text import build_text_encoder
@@ -97,9 +99,11 @@ def check_parts(config: ModelConfig) -> None:
     """Raise a ValueError where two parts do not fit each other; the message says what to set."""
     parser, renderer, text = config.parser, config.renderer, config.text
     layout, side = parser.layout, parser.image_size
-    if isinstance(renderer, GlimpseConfig) and not layout.explicit:
+    if isinstance(renderer, PictureConfig) and not layout.explicit:
         needs = "parser.layout.explicit = true: it draws a slot at its own place"
-        raise ValueError(f"renderer.kind 'glimpse' needs {needs}")
+        raise ValueError(f"renderer.kind {renderer.kind!r} needs {needs}")
+    if isinstance(renderer, CarryConfig) and not isinstance(parser, VotesConfig):
+        raise ValueError("renderer.kind 'carry' needs to know which slot is the robot: set parser.kind=votes")
     if isinstance(renderer, UpsampleConfig):
         if layout.explicit or parser.num_slots != 1:
             raise ValueError(

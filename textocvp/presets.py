@@ -12,6 +12,7 @@ from textocvp.parsers.votes import VotesConfig
 from textocvp.predictors.ocvp_seq import OCVPSeqConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers.broadcast import BroadcastConfig
+from textocvp.renderers.carry import CarryConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.patches import FeatureConfig, PatchConfig
 from textocvp.renderers.upsample import UpsampleConfig
@@ -83,9 +84,13 @@ NON_OC = ModelConfig(
     text=PUBLISHED_TEXT,
     predictor=PUBLISHED,
 )
-# CLIPort's scene at half its size, on CPUs.
-CLIPORT_VOTES = replace(
-    TABLETOP_SMALL, name="cliport-votes", parser=VotesConfig(image_size=168, num_slots=12)
+# CLIPort's scene on CPUs: slots from half its size, and whole episodes, which have up to 57 frames.
+CLIPORT = ModelConfig(
+    name="cliport",
+    parser=VotesConfig(image_size=168, num_slots=12),
+    renderer=CarryConfig(),
+    text=SMALL_TEXT,
+    predictor=replace(SMALL, color_bias=True, window=56),
 )
 OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
 OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
@@ -95,7 +100,7 @@ _ALL = (
     SAVI_SMALL,
     SAVI_CATER,
     CLIPORT_DINO,
-    CLIPORT_VOTES,
+    CLIPORT,
     OCVP_SEQ_SMALL,
     OCVP_SEQ,
     NON_OC_SMALL,
@@ -110,7 +115,7 @@ DESCRIPTIONS = {
     "savi-small": "TextOCVP with published slots, small, for ablations of the parser",
     "savi-cater": "TextOCVP-SAVi at the paper's sizes (CATER)",
     "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
-    "cliport-votes": "TextOCVP with a parser that has learned to see, for CLIPort's scene at 168x168",
+    "cliport": "TextOCVP for CLIPort's scene: a parser that has learned to see, and sharp frames of 336x336",
     "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
     "ocvp-seq": "OCVP-Seq, no text, at its published size",
     "non-oc-small": "Non-OC, one slot for the whole scene, small",

@@ -32,7 +32,7 @@ class VideoModel(Protocol):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(H, W) in pixels of the frames that it was trained on; it takes no others."""
+        """(H, W) in pixels of the frames that it was trained on; a `WorldModel` also takes whole multiples of it."""
 
     @property
     def longest_horizon(self) -> int | None:

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from textocvp.drawing import save_film
 from textocvp.layers import pixel_grid
-from textocvp.renderers.base import Renderer
+from textocvp.renderers.base import Rendered, Renderer, Seen
 from textocvp.slots import SlotLayout, SlotState
 
 CHUNK = 64  # pictures that the renderer draws at once: enough to keep two cores busy, and few enough for their cache
+CHUNK_SEEN = 8  # where it draws with first frames in mind, which may be large
 
 
-Draw = Callable[[Tensor], tuple[Tensor, ...]]  # of slots (N, K, D)
+Draw = Callable[[Tensor, Seen | None], tuple[Tensor, ...]]  # of slots (N, K, D), and what they go on from
 
 
 @dataclass
@@ -49,6 +50,8 @@ class Rollout:
     renderer: Renderer  # draws the slots
     # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for.
     attention: Tensor | None = None
+    # What the renderer keeps of each sequence's first frame, which may be that of an earlier rollout.
+    seen: tuple[Seen, ...] | None = None
     _decoded: _Decoded = field(default_factory=_Decoded)
 
     def __repr__(self) -> str:
@@ -68,18 +71,24 @@ class Rollout:
 
     def decode_masks(self, frames: slice | Sequence[int]) -> Tensor:
         """Masks (B, t, K, H, W) of only these frames; an IndexError if there is no such frame."""
+
+        def draw(slots_NKD: Tensor, seen: Seen | None) -> tuple[Tensor, ...]:
+            if seen is None:
+                return (self.renderer.masks(slots_NKD).float(),)
+            return (self._rendered(slots_NKD, seen).masks_BKHW.float(),)
+
         times, decoded = self._times(frames), self._decoded.masks
         new = [t for t in dict.fromkeys(times) if t not in decoded]
         if new:
-            (masks_BtKHW,) = self._draw(new, lambda slots: (self.renderer.masks(slots).float(),))
+            (masks_BtKHW,) = self._draw(new, draw)
             decoded.update(zip(new, masks_BtKHW.unbind(1), strict=True))
         return torch.stack([decoded[t] for t in times], dim=1)
 
     def decode_frames(self, frames: slice | Sequence[int]) -> Tensor:
         """Pictures (B, t, 3, H, W), RGB 0..1, of only these frames; an IndexError if there is no such frame."""
 
-        def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
-            rendered = self.renderer(slots_NKD)
+        def draw(slots_NKD: Tensor, seen: Seen | None) -> tuple[Tensor, ...]:
+            rendered = self._rendered(slots_NKD, seen)
             return _to_rgb(rendered.frames_B3HW), rendered.masks_BKHW.float()
 
         times, decoded = self._times(frames), self._decoded.frames
@@ -101,8 +110,8 @@ class Rollout:
             IndexError: if there is no such frame.
         """
 
-        def draw(slots_NKD: Tensor) -> tuple[Tensor, ...]:
-            return (_to_rgb(self.renderer(slots_NKD).object_frames_BK3HW),)
+        def draw(slots_NKD: Tensor, seen: Seen | None) -> tuple[Tensor, ...]:
+            return (_to_rgb(self._rendered(slots_NKD, seen).object_frames_BK3HW),)
 
         return self._draw(self._times(frames), draw, at_once=max(1, CHUNK // self.slots.shape[2]))[0]
 
@@ -123,11 +132,20 @@ class Rollout:
             raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
         return times
 
+    def _rendered(self, slots_NKD: Tensor, seen: Seen | None) -> Rendered:
+        return self.renderer(slots_NKD) if seen is None else self.renderer(slots_NKD, seen)
+
     @torch.no_grad()
     def _draw(self, times: list[int], draw: Draw, at_once: int = CHUNK) -> list[Tensor]:
         """What `draw` makes of these frames' slots (N, K, D): its results, each (B, t, ...)."""
         B, _, K, D = self.slots.shape
-        drawn = [draw(slots_NKD) for slots_NKD in self.slots[:, times].reshape(-1, K, D).split(at_once)]
+        parts: list[tuple[Tensor, Seen | None]]
+        if self.seen is None:
+            parts = [(part, None) for part in self.slots[:, times].reshape(-1, K, D).split(at_once)]
+        else:
+            pairs = zip(self.slots[:, times], self.seen, strict=True)
+            parts = [(part, seen) for slots_tKD, seen in pairs for part in slots_tKD.split(CHUNK_SEEN)]
+        drawn = [draw(*part) for part in parts]
         return [torch.cat(part).unflatten(0, (B, len(times))) for part in zip(*drawn, strict=True)]
 
     # ---- where and what the slots are
@@ -199,6 +217,7 @@ class Rollout:
             slots=self.slots[keep],
             texts=tuple(self.texts[i] for i in keep) if self.texts else (),
             attention=None if self.attention is None else self.attention[keep],
+            seen=None if self.seen is None else tuple(self.seen[i] for i in keep),
             _decoded=_Decoded(*kept),
         )
 

@@ -20,6 +20,8 @@ PRESENCE_UNUSED, PRESENCE_THING, PRESENCE_BACKGROUND = 0.0, 1.0, 2.0
 MIN_USED = (PRESENCE_UNUSED + PRESENCE_THING) / 2
 MIN_BACKGROUND = (PRESENCE_THING + PRESENCE_BACKGROUND) / 2
 
+ROBOT_SLOT = 1  # of parsers that tell the robot from things
+
 MIN_SCALE = 0.012  # smallest standard deviation of a slot, in -1..1: about a third of a pixel at 64x64
 
 

@@ -9,12 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, resolve_checkpoint
-from textocvp.inputs import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
+from textocvp.inputs import (
+    checked_frames,
+    checked_horizon,
+    checked_pairs,
+    checked_texts,
+    observed_images,
+    times_larger,
+)
 from textocvp.model import TextOCVP
-from textocvp.parsers.base import Parsed
 from textocvp.rollout import Rollout
 
 __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
@@ -57,7 +64,7 @@ class WorldModel:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(H, W) of the only frames that it understands, in pixels."""
+        """(H, W) of the frames that it was trained on, in pixels; it also takes whole multiples of that."""
         side = self.model.config.parser.image_size
         return side, side
 
@@ -85,7 +92,8 @@ class WorldModel:
 
         Args:
             obs: what is seen now: the environment's observation (a mapping with `rgb`), an image (H, W, 3) or images
-                (B, H, W, 3), uint8. Or a rollout, to go on from its last slots.
+                (B, H, W, 3), uint8, of `image_size` or a whole multiple of it. Or a rollout, to go on from its last
+                slots; what is drawn with the first frame in mind still is.
             text: what is to be done.
             horizon: how many frames to imagine after the one that is seen.
             seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
@@ -94,7 +102,8 @@ class WorldModel:
             attention: also keep the attention from slots to words.
 
         Returns:
-            A rollout of `horizon + 1` frames, the first of which is the parsed observation.
+            A rollout of `horizon + 1` frames, the first of which is the parsed observation. It is of the model's own
+            `image_size`, or, if the renderer remembers first frames (`carry`), of theirs.
 
         Raises:
             TypeError: if the observation is none of the above or not uint8, or a text is no string.
@@ -109,14 +118,17 @@ class WorldModel:
         texts = checked_texts(text, self.model.text)
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
         checked_horizon(horizon, self.longest_horizon, hint)
-        slots_BKD = self._first_slots(obs, seed, num_slots)
-        B = checked_pairs(len(slots_BKD), len(texts))
+        start = self._start(obs, seed, num_slots)
+        B = checked_pairs(len(start), len(texts))
         texts = texts * B if len(texts) == 1 else texts
-        seed_B1KD = slots_BKD.expand(B, -1, -1)[:, None]
+        seed_B1KD = start.slots[:, -1:].to(self.model.device).expand(B, -1, -1, -1)
         tokens = self.model.text(texts)
         imagined = self.model.predictor.rollout(seed_B1KD, tokens, horizon, return_attention=attention)
         slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
-        return self._as_rollout(slots_BTKD, tuple(texts), imagined.attention_BSnhKL)
+        seen = start.seen * B if start.seen is not None and len(start) == 1 else start.seen
+        attention_BSnhKL = imagined.attention_BSnhKL
+        size, layout, renderer = start.image_size, self.model.parser.layout, self.model.renderer
+        return Rollout(slots_BTKD, tuple(texts), size, layout, renderer, attention_BSnhKL, seen)
 
     def imagine(
         self,
@@ -146,9 +158,8 @@ class WorldModel:
             raise ValueError(f"video must be (T, H, W, 3) or (B, T, H, W, 3), not {frames.shape}")
         B, T = frames.shape[:-3] if frames.ndim == 5 else (1, len(frames))
         images = frames.reshape(-1, *frames.shape[-3:])
-        frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video")
-        parsed = self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
-        return self._as_rollout(parsed.slots_BTKD.float(), (), None)
+        frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video", multiples=True)
+        return self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
 
     def words(self, text: str) -> list[str]:
         """A sentence as the text encoder splits it: what the last axis of `Rollout.attention` stands for."""
@@ -156,30 +167,34 @@ class WorldModel:
             raise TypeError(f"a text must be a string, not {type(text).__name__}")
         return self.model.text.words(text)
 
-    def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Parsed:
+    def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Rollout:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
-        generator = torch.Generator(device=self.model.device).manual_seed(seed)
-        return self.model.parser(frames_BT3HW, num_slots=num_slots, generator=generator)
+        model, (H, W) = self.model, self.image_size
+        generator = torch.Generator(device=model.device).manual_seed(seed)
+        own_BT3HW = F.adaptive_avg_pool2d(frames_BT3HW.flatten(0, 1), (H, W)).unflatten(
+            0, frames_BT3HW.shape[:2]
+        )
+        parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generator)
+        slots_BTKD = parsed.slots_BTKD.float()
+        seen = model.renderer.remember(frames_BT3HW[:, 0], parsed.attention_BTKHW[:, 0], slots_BTKD[:, 0])
+        size = self.image_size if seen is None else (frames_BT3HW.shape[-2], frames_BT3HW.shape[-1])
+        return Rollout(slots_BTKD, (), size, model.parser.layout, model.renderer, seen=seen)
 
-    def _first_slots(
+    def _start(
         self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int, num_slots: int | None
-    ) -> Tensor:
+    ) -> Rollout:
         if isinstance(obs, Rollout):
             own = obs.slots.shape[2]
             if num_slots not in (None, own):
                 raise ValueError(
                     f"this rollout goes on with its own {own} slots; num_slots={num_slots} is for images"
                 )
-            if obs.layout != self.model.parser.layout or obs.image_size != self.image_size:
+            if obs.layout != self.model.parser.layout or times_larger(obs.image_size, self.image_size) == 0:
                 raise ValueError(
                     f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} "
                     f"pixels, this model's are {self.model.parser.layout} at {self.image_size}"
                 )
-            return obs.slots[:, -1].to(self.model.device)
-        frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)
-        return self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
-
-    def _as_rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...], attention: Tensor | None) -> Rollout:
-        model = self.model
-        return Rollout(slots_BTKD, texts, self.image_size, model.parser.layout, model.renderer, attention)
+            return obs
+        frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device, multiples=True)
+        return self._parsed(frames_B3HW[:, None], seed, num_slots)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from textocvp.renderers.base import Rendered, Renderer, RendererConfig
+from textocvp.renderers.base import Rendered, Renderer, RendererConfig, Seen
 from textocvp.renderers.broadcast import BroadcastRenderer
+from textocvp.renderers.carry import CarryRenderer
 from textocvp.renderers.glimpse import GlimpseRenderer
 from textocvp.renderers.patches import FeatureRenderer, PatchRenderer
 from textocvp.renderers.upsample import UpsampleRenderer
 from textocvp.slots import SlotLayout
 
-__all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "build_renderer"]
+__all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "Seen", "build_renderer"]
 
 RENDERERS: dict[str, type[Renderer]] = {
     "glimpse": GlimpseRenderer,  # a small picture a slot, pasted at the slot's place: the renderer that ships
+    "carry": CarryRenderer,  # the same, and what the first frame shows is copied from it
     "patches": PatchRenderer,  # an MLP draws patch by patch
     "features": FeatureRenderer,  # published for CLIPort: the MLP redraws DINOv2's features
     "broadcast": BroadcastRenderer,  # published for CATER: spatial broadcast decoder

@@ -33,6 +33,18 @@ class Rendered:
         return self.draw_objects()
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What a renderer keeps of the first frame of one sequence, H and W its side: a multiple of the model's."""
+
+    frame_3HW: Tensor  # -1..1
+    clean_3HW: (
+        Tensor  # the same without robot and things, where nothing hides it; the rest is filled from that
+    )
+    labels_HW: Tensor  # the number of the slot that each pixel belongs to, int64
+    slots_KD: Tensor  # the slots of that frame
+
+
 class Renderer(nn.Module):
     """Slots to pixels. Subclasses set `Config` and write `forward` and, where colours cost much, a cheaper `masks`.
 
@@ -49,6 +61,20 @@ class Renderer(nn.Module):
     def masks(self, slots_BKD: Tensor) -> Tensor:
         """Only the masks (B, K, H, W), for callers that look at no colours: a planner scores masks."""
         return self(slots_BKD).masks_BKHW
+
+    def remember(
+        self, frames_B3HW: Tensor, attention_BKhw: Tensor, slots_BKD: Tensor
+    ) -> tuple[Seen, ...] | None:
+        """What it keeps of B first frames, to draw the rest of each sequence with: `forward(slots_TKD, seen)`.
+
+        Args:
+            frames_B3HW: -1..1, their side the model's `image_size` or a whole multiple of it.
+            attention_BKhw, slots_BKD: what the parser made of them.
+
+        Returns:
+            one `Seen` a sequence; None if it draws from slots alone.
+        """
+        return None
 
     def places(self, slots_BKD: Tensor) -> tuple[Tensor, Tensor] | None:
         """Centres and standard deviations (x, y), each (B, K, 2) in -1..1, if it reads them off unexplained slots."""

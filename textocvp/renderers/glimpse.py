@@ -7,7 +7,7 @@ it stands (Invariant Slot Attention, Biza et al. 2023).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,13 +19,19 @@ from textocvp.slots import SlotLayout, SlotState
 
 
 @dataclass(frozen=True)
-class GlimpseConfig(RendererConfig):
-    """Options of `GlimpseRenderer`."""
+class PictureConfig(RendererConfig):
+    """Options of the canonical pictures of slots."""
 
-    kind: Literal["glimpse"] = "glimpse"
     hidden: int = 256  # width of the decoder's fully connected layers
     crop_cells: int = 24  # side in cells of the canonical picture of a slot
     crop_extent: float = 2.6  # how many standard deviations that picture reaches to each side
+
+
+@dataclass(frozen=True)
+class GlimpseConfig(PictureConfig):
+    """Options of `GlimpseRenderer`."""
+
+    kind: Literal["glimpse"] = "glimpse"
 
 
 class GlimpseRenderer(Renderer):
@@ -36,9 +42,9 @@ class GlimpseRenderer(Renderer):
     behind everything for the fixed camera, is the background slot's colour times a learned shading.
     """
 
-    Config = GlimpseConfig
+    Config: ClassVar[type[RendererConfig]] = GlimpseConfig
 
-    def __init__(self, config: GlimpseConfig, layout: SlotLayout, image_size: int) -> None:
+    def __init__(self, config: PictureConfig, layout: SlotLayout, image_size: int) -> None:
         super().__init__()
         self.layout, self.image_size = layout, image_size
         self.cells, self.extent = config.crop_cells, config.crop_extent
@@ -53,7 +59,7 @@ class GlimpseRenderer(Renderer):
 
     def forward(self, slots: Tensor) -> Rendered:
         state = SlotState.split(slots, self.layout)
-        logits_BKHW, shading_BKHW = self._pictures(state).unbind(2)
+        logits_BKHW, shading_BKHW = self._pictures(state, self.image_size).unbind(2)
         masks_BKHW = self._compete(logits_BKHW, state)
         shading_BKHW = torch.where(state.is_background[..., None], self.canvas, shading_BKHW)
         light_BKHW = 1 + shading_BKHW
@@ -69,15 +75,14 @@ class GlimpseRenderer(Renderer):
     def masks(self, slots: Tensor) -> Tensor:
         """As `Renderer.masks`, at half the cost of `forward`."""
         state = SlotState.split(slots, self.layout)
-        return self._compete(self._pictures(state, logits_only=True)[:, :, 0], state)
+        return self._compete(self._pictures(state, self.image_size, channels=1)[:, :, 0], state)
 
-    def _pictures(self, state: SlotState, logits_only: bool = False) -> Tensor:
+    def _pictures(self, state: SlotState, size: int, channels: int = 2) -> Tensor:
+        """Alpha logits and shading (B, K, channels, size, size) of the slots where they are."""
         B, K, _ = state.content.shape
-        channels = 1 if logits_only else 2
         cells = self.decoder(state.content).view(B, K, 2, self.cells, self.cells)[:, :, :channels]
         # Drawn relative to NOTHING, so that the zeros outside of a glimpse mean "nothing here".
         offset = torch.tensor([NOTHING, 0.0], device=cells.device, dtype=cells.dtype)[:channels, None, None]
-        size = self.image_size
         return paste(cells - offset, state.position, state.scale, size, size, self.extent) + offset
 
     def _compete(self, logits_BKHW: Tensor, state: SlotState) -> Tensor:
