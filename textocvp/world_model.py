@@ -12,10 +12,18 @@ import torch
 from torch import Tensor
 
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, resolve_checkpoint
-from textocvp.inputs import checked_frames, checked_horizon, checked_pairs, checked_texts, observed_images
+from textocvp.inputs import (
+    checked_frames,
+    checked_horizon,
+    checked_pairs,
+    checked_texts,
+    observed_images,
+    warn_of_foreign,
+)
+from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import Parsed
-from textocvp.rollout import Rollout
+from textocvp.rollout import CHUNK, Rollout
 
 __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
 
@@ -101,7 +109,8 @@ class WorldModel:
             ValueError: if a shape, value or size, the horizon or a text is not allowed; the message says what is.
 
         Warns:
-            UserWarning: if the text encoder does not know a word, which is named, or if the predictor is untrained.
+            UserWarning: if the text encoder does not know a word, which is named, if the predictor is untrained, or if
+                the observation does not look like what the model was trained on; the likely cause is named.
         """
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
@@ -140,6 +149,9 @@ class WorldModel:
 
         Raises:
             TypeError, ValueError: as `rollout`.
+
+        Warns:
+            UserWarning: if a first frame does not look like the pictures that the model was trained on.
         """
         frames = np.asarray(video)
         if frames.ndim not in (4, 5):
@@ -148,6 +160,7 @@ class WorldModel:
         images = frames.reshape(-1, *frames.shape[-3:])
         frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video")
         parsed = self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
+        self._warn_of_foreign(frames_N3HW[::T], parsed.slots_BTKD[:, 0], seed, num_slots, depth=3)
         return self._as_rollout(parsed.slots_BTKD.float(), (), None)
 
     def words(self, text: str) -> list[str]:
@@ -178,7 +191,27 @@ class WorldModel:
                 )
             return obs.slots[:, -1].to(self.model.device)
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device)
-        return self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
+        slots_BKD = self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
+        self._warn_of_foreign(frames_B3HW, slots_BKD, seed, num_slots, depth=4)
+        return slots_BKD
+
+    def _warn_of_foreign(
+        self, frames_B3HW: Tensor, slots_BKD: Tensor, seed: int, num_slots: int | None, depth: int
+    ) -> None:
+        """Redraw the pictures that a rollout begins with, and warn where they are not of the model's world."""
+        own = self.model.config.own_frames
+        if (
+            own is None or slots_BKD.shape[1] < self.model.config.parser.num_slots
+        ):  # too few redraw nothing well
+            return
+
+        def psnr_of(frames_B3HW: Tensor, slots_BKD: Tensor | None = None) -> Tensor:
+            if slots_BKD is None:
+                slots_BKD = self._parsed(frames_B3HW[:, None], seed, num_slots).slots_BTKD[:, 0]
+            drawn = [self.model.renderer(part).frames_B3HW for part in slots_BKD.split(CHUNK)]
+            return psnr((torch.cat(drawn).clamp(-1, 1) + 1) / 2, (frames_B3HW + 1) / 2)
+
+        warn_of_foreign(frames_B3HW, psnr_of(frames_B3HW, slots_BKD), own, psnr_of, depth=depth + 1)
 
     def _as_rollout(self, slots_BTKD: Tensor, texts: tuple[str, ...], attention: Tensor | None) -> Rollout:
         model = self.model

@@ -27,7 +27,7 @@ from textocvp.model import TextOCVP
 from textocvp.presets import preset
 from textocvp.slots import SlotState
 from textocvp.training.clips import ClipTraining, clip_reader, save_samples, to_pictures
-from textocvp.training.evaluate_parser import ParserMetrics, measure_parser
+from textocvp.training.evaluate_parser import ParserMetrics, measure_own_frames, measure_parser
 from textocvp.training.losses import (
     ParserLoss,
     image_loss,
@@ -167,7 +167,12 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                 run.backward(total, vars(loss))
             run.update(step)
             run.evaluate(step, measure, lambda path: draw_samples(model, held_out, path))
-        metrics = run.finish(model.save_pretrained, measure, "quality.json")
+
+        def save(folder: Path) -> None:
+            model.config = replace(model.config, own_frames=measure_own_frames(model, held_out))
+            model.save_pretrained(folder)
+
+        metrics = run.finish(save, measure, "quality.json")
         for sentence in metrics.below_threshold() if metrics is not None else ():
             print(f"not good enough to train a predictor on: {sentence}")
     close_run(accelerator)
