@@ -1,0 +1,154 @@
+"""The same scene in other light or through a worse camera: does the imagined block still reach the named bowl?"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from experiments.report.rows import Row, rate_row
+from experiments.report.tables import TableSpec, columns
+from experiments.study.methods import HORIZON, lines
+from experiments.study.pool import Worker
+from experiments.study.scenes import StudyScene, sample_scene
+from planning import Instruction, Thing
+from textocvp.slots import SlotState
+from textocvp.training.evaluate_predictor import REACHED, place_and_size, slot_at
+
+Picture = NDArray[np.uint8]
+WOOD = (139, 101, 66)  # RGB
+
+
+def brighten(
+    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, factor: float
+) -> Picture:
+    """All of the light is `factor` times as strong."""
+    return _picture(rgb_HW3 * factor)
+
+
+def shade(rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, share: float) -> Picture:
+    """The light falls from 1 + `share` at one edge, in a random direction, to 1 - `share` at the other."""
+    H, W, _ = rgb_HW3.shape
+    angle = rng.uniform(0, 2 * np.pi)
+    across_HW = np.cos(angle) * np.linspace(-1, 1, W) + np.sin(angle) * np.linspace(-1, 1, H)[:, None]
+    return _picture(rgb_HW3 * (1 + share * across_HW / abs(across_HW).max())[..., None])
+
+
+def add_noise(
+    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, sigma: float
+) -> Picture:
+    """Gaussian noise of deviation `sigma`, of 0..255, independent in every pixel and channel."""
+    return _picture(rgb_HW3 + sigma * rng.standard_normal(rgb_HW3.shape))
+
+
+def compress(
+    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, quality: int
+) -> Picture:
+    """JPEG, with halved colour planes as usual."""
+    file = io.BytesIO()
+    Image.fromarray(rgb_HW3).save(file, "jpeg", quality=quality)
+    return np.asarray(Image.open(file))
+
+
+def lay_wood(rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator) -> Picture:
+    """The table is of four brown planks, up to 15 % lighter or darker, with grain of deviation 10 % along them."""
+    H, W = table_HW.shape
+    pixel = 64 / H  # what follows is in pixels of a picture of 64
+    noise_HW = ndimage.gaussian_filter(rng.standard_normal((H, W)), (0.7 / pixel, 12 / pixel), mode="reflect")
+    plank_H = rng.uniform(-0.15, 0.15, 4)[np.arange(H) * 4 // H]
+    wood_HW3 = np.array(WOOD) * (1 + plank_H[:, None] + 0.1 * noise_HW / noise_HW.std())[..., None]
+    return _picture(np.where(table_HW[..., None], wood_HW3, rgb_HW3))
+
+
+Change = Callable[[Picture, NDArray[np.bool_], np.random.Generator], Picture]
+
+UNCHANGED = "unchanged"
+CHANGES: Mapping[str, Change] = {
+    UNCHANGED: lambda rgb_HW3, table_HW, rng: rgb_HW3,
+    "light x 0.7": partial(brighten, factor=0.7),
+    "light x 1.25": partial(brighten, factor=1.25),
+    "light gradient 25 %": partial(shade, share=0.25),
+    "noise, sigma 8": partial(add_noise, sigma=8.0),
+    "JPEG, quality 75": partial(compress, quality=75),
+    "wooden table": lay_wood,
+}
+"""Title of a column -> what is done to the observation (H, W, 3), of which `table_HW` shows the table."""
+
+
+def _picture(values_HW3: NDArray[Any]) -> Picture:
+    return values_HW3.round().clip(0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class ChangedOutcome:
+    """What came of a scene in another light."""
+
+    scene: StudyScene  # which
+    change: str  # key of `CHANGES`
+    reached: bool  # the imagined block ends within 6 pixels of 64 of the named bowl
+    warned: bool  # the model said that the picture is not of its world
+
+
+@dataclass(frozen=True)
+class ChangedScene:
+    """A unit of work: one changed observation, imagined with the scene's own sentence.
+
+    The true masks say which slots hold the block and the bowl, as in `InstructionFollowing`: what is measured is the
+    model, not the grounding by colour.
+    """
+
+    scene: StudyScene
+    change: str
+    seed: int
+
+    def run(self, worker: Worker) -> ChangedOutcome:
+        """Change, imagine, look where the block ends."""
+        sampled = sample_scene(worker.environment(self.scene), self.scene)
+        rgb, labels_HW = sampled.observation["rgb"], sampled.info["segmentation"]
+        table_HW = (labels_HW == 0) & (rgb == np.array(sampled.info["palette"]["table"])).all(-1)
+        rng = np.random.default_rng([self.scene.seed, 4])
+        changed = CHANGES[self.change](rgb, table_HW, rng)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            rollout = worker.world_model.rollout(changed, sampled.texts[0], horizon=HORIZON, seed=self.seed)
+        first, last = (SlotState.split(rollout.slots[0, t].cpu(), rollout.layout) for t in (0, -1))
+        asked = Instruction.parse(sampled.texts[0])
+        label_of = {Thing(item["color"], item["kind"]): item["label"] for item in sampled.info["objects"]}
+        block, bowl = (
+            slot_at(first, *place_and_size(labels_HW == label_of[thing]))
+            for thing in (asked.thing, asked.target)
+        )
+        off = float(torch.dist(last.position[block], first.position[bowl]))
+        warned = any("does not look like" in str(one.message) for one in said)
+        return ChangedOutcome(self.scene, self.change, min(block, bowl) >= 0 and off < REACHED, warned)
+
+
+def change_rows(outcomes: Sequence[ChangedOutcome]) -> list[Row]:
+    """For each split and change the share of scenes that reach the bowl, and the share that is warned of."""
+    found: dict[tuple[str, str], list[ChangedOutcome]] = {}
+    for one in outcomes:
+        found.setdefault((one.scene.split, one.change), []).append(one)
+    return [
+        rate_row("ours", *place, metric, [getattr(one, metric) for one in its])
+        for place, its in found.items()
+        for metric in ("reached", "warned")
+    ]
+
+
+def change_tables(split: str) -> list[TableSpec]:
+    """What `change_rows` makes of a split, a column a change."""
+    titles = {
+        "reached": "The imagined block reaches the named bowl",
+        "warned": "The model says that the picture is not of its world",
+    }
+    places = {change: (split, change) for change in CHANGES}
+    return [TableSpec(title, columns(metric, places), lines(["ours"])) for metric, title in titles.items()]
