@@ -29,6 +29,10 @@ HUE_SHARE = 0.005  # of the pixels: what counts as showing a hue
 DARK = 40  # of 0..255; a colour below it has no hue
 
 
+class ForeignPictureWarning(UserWarning):
+    """A picture does not look like those that the model was trained on."""
+
+
 @dataclass(frozen=True)
 class OwnFrames:
     """What a model makes of held-out first frames of its own world; `measure_own_frames` makes it."""
@@ -106,7 +110,7 @@ def warn_of_foreign(
     depth: int,
     what: str = "the observation",
 ) -> None:
-    """A `UserWarning`, with the likely cause, for the first picture that is not of the model's world.
+    """A `ForeignPictureWarning`, with the likely cause, for the first picture that is not of the model's world.
 
     Its words are the same for every picture of one cause, so that Python shows it once.
 
@@ -144,7 +148,7 @@ def warn_of_foreign(
         warnings.warn(
             f"{what} does not look like the pictures that this model was trained on: it probably {cause}. "
             "What is imagined from it may mean nothing",
-            UserWarning,
+            ForeignPictureWarning,
             stacklevel=depth + 1,
         )
         return

@@ -109,8 +109,9 @@ class WorldModel:
             ValueError: if a shape, value or size, the horizon or a text is not allowed; the message says what is.
 
         Warns:
-            UserWarning: if the text encoder does not know a word, which is named, if the predictor is untrained, or if
-                the observation does not look like what the model was trained on; the likely cause is named.
+            UserWarning: if the text encoder does not know a word, which is named, or if the predictor is untrained.
+            ForeignPictureWarning: a UserWarning, if the observation does not look like the pictures that the model was
+                trained on; the likely cause is named.
         """
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
@@ -151,7 +152,7 @@ class WorldModel:
             TypeError, ValueError: as `rollout`.
 
         Warns:
-            UserWarning: if a first frame does not look like the pictures that the model was trained on.
+            ForeignPictureWarning: if a first frame does not look like the pictures that the model was trained on.
         """
         frames = np.asarray(video)
         if frames.ndim not in (4, 5):

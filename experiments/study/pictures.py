@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -21,10 +20,11 @@ from experiments.study.methods import HORIZON, lines
 from experiments.study.pool import Worker
 from experiments.study.scenes import StudyScene, sample_scene
 from planning import Instruction, Thing
-from textocvp.slots import SlotState
-from textocvp.training.evaluate_predictor import REACHED, place_and_size, slot_at
+from textocvp.inputs import ForeignPictureWarning
 
 Picture = NDArray[np.uint8]
+REACHED_PX = 6  # of 64: a block that ends closer than this to where the bowl's slot started is at it
+FOUND = 0.25  # IoU above which a slot holds a thing
 WOOD = (139, 101, 66)  # RGB
 
 
@@ -119,17 +119,27 @@ class ChangedScene:
         changed = CHANGES[self.change](rgb, table_HW, rng)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            rollout = worker.world_model.rollout(changed, sampled.texts[0], horizon=HORIZON, seed=self.seed)
-        first, last = (SlotState.split(rollout.slots[0, t].cpu(), rollout.layout) for t in (0, -1))
+            rollout = worker.world_model.rollout(changed, [sampled.texts[0]], horizon=HORIZON, seed=self.seed)
         asked = Instruction.parse(sampled.texts[0])
         label_of = {Thing(item["color"], item["kind"]): item["label"] for item in sampled.info["objects"]}
-        block, bowl = (
-            slot_at(first, *place_and_size(labels_HW == label_of[thing]))
-            for thing in (asked.thing, asked.target)
+        seen_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
+        block, bowl = (_best_slot(seen_HW, labels_HW == label_of[one]) for one in (asked.thing, asked.target))
+        places_TK2 = rollout.positions[0].cpu() * 64 / rollout.image_size[0]
+        reached = min(block, bowl) >= 0 and bool(
+            (places_TK2[-1, block] - places_TK2[0, bowl]).norm() < REACHED_PX
         )
-        off = float(torch.dist(last.position[block], first.position[bowl]))
-        warned = any("does not look like" in str(one.message) for one in said)
-        return ChangedOutcome(self.scene, self.change, min(block, bowl) >= 0 and off < REACHED, warned)
+        warned = any(issubclass(one.category, ForeignPictureWarning) for one in said)
+        return ChangedOutcome(self.scene, self.change, reached, warned)
+
+
+def _best_slot(seen_HW: NDArray[np.int64], true_HW: NDArray[np.bool_]) -> int:
+    """The slot whose pixels overlap a true mask best; -1 if none does by an IoU of `FOUND`."""
+    ious = {
+        slot: true_HW[seen_HW == slot].sum() / (true_HW | (seen_HW == slot)).sum()
+        for slot in np.unique(seen_HW)
+    }
+    best = max(ious, key=lambda slot: ious[slot])
+    return int(best) if ious[best] >= FOUND else -1
 
 
 def change_rows(outcomes: Sequence[ChangedOutcome]) -> list[Row]:
