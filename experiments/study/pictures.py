@@ -6,7 +6,6 @@ import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,70 +21,54 @@ from experiments.study.scenes import StudyScene, sample_scene
 from planning import Instruction, Thing
 from textocvp.inputs import ForeignPictureWarning
 
-Picture = NDArray[np.uint8]
 REACHED_PX = 6  # of 64: a block that ends closer than this to where the bowl's slot started is at it
 FOUND = 0.25  # IoU above which a slot holds a thing
 WOOD = (139, 101, 66)  # RGB
 
-
-def brighten(
-    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, factor: float
-) -> Picture:
-    """All of the light is `factor` times as strong."""
-    return _picture(rgb_HW3 * factor)
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
-def shade(rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, share: float) -> Picture:
-    """The light falls from 1 + `share` at one edge, in a random direction, to 1 - `share` at the other."""
+def change_picture(name: str, rgb_HW3: Picture, table_HW: Mask, rng: np.random.Generator) -> Picture:
+    """A picture changed as `CHANGES` says; `table_HW` is where it shows the table."""
+    return CHANGES[name](rgb_HW3, table_HW, rng).round().clip(0, 255).astype(np.uint8)
+
+
+def _shade(rgb_HW3: Picture, _: Mask, rng: np.random.Generator) -> NDArray[Any]:
+    """Light from 125 % at one edge, in a random direction, to 75 % at the other."""
     H, W, _ = rgb_HW3.shape
     angle = rng.uniform(0, 2 * np.pi)
     across_HW = np.cos(angle) * np.linspace(-1, 1, W) + np.sin(angle) * np.linspace(-1, 1, H)[:, None]
-    return _picture(rgb_HW3 * (1 + share * across_HW / abs(across_HW).max())[..., None])
+    return rgb_HW3 * (1 + 0.25 * across_HW / abs(across_HW).max())[..., None]
 
 
-def add_noise(
-    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, sigma: float
-) -> Picture:
-    """Gaussian noise of deviation `sigma`, of 0..255, independent in every pixel and channel."""
-    return _picture(rgb_HW3 + sigma * rng.standard_normal(rgb_HW3.shape))
-
-
-def compress(
-    rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator, quality: int
-) -> Picture:
-    """JPEG, with halved colour planes as usual."""
+def _compress(rgb_HW3: Picture, _: Mask, rng: np.random.Generator) -> NDArray[Any]:
+    """JPEG of quality 75, with halved colour planes as usual."""
     file = io.BytesIO()
-    Image.fromarray(rgb_HW3).save(file, "jpeg", quality=quality)
+    Image.fromarray(rgb_HW3).save(file, "jpeg", quality=75)
     return np.asarray(Image.open(file))
 
 
-def lay_wood(rgb_HW3: Picture, table_HW: NDArray[np.bool_], rng: np.random.Generator) -> Picture:
-    """The table is of four brown planks, up to 15 % lighter or darker, with grain of deviation 10 % along them."""
+def _lay_wood(rgb_HW3: Picture, table_HW: Mask, rng: np.random.Generator) -> NDArray[Any]:
+    """A table of four brown planks, up to 15 % lighter or darker, with grain of deviation 10 % along them."""
     H, W = table_HW.shape
-    pixel = 64 / H  # what follows is in pixels of a picture of 64
-    noise_HW = ndimage.gaussian_filter(rng.standard_normal((H, W)), (0.7 / pixel, 12 / pixel), mode="reflect")
+    noise_HW = ndimage.gaussian_filter(rng.standard_normal((H, W)), (0.7 * H / 64, 12 * H / 64))
     plank_H = rng.uniform(-0.15, 0.15, 4)[np.arange(H) * 4 // H]
     wood_HW3 = np.array(WOOD) * (1 + plank_H[:, None] + 0.1 * noise_HW / noise_HW.std())[..., None]
-    return _picture(np.where(table_HW[..., None], wood_HW3, rgb_HW3))
+    return np.where(table_HW[..., None], wood_HW3, rgb_HW3)
 
-
-Change = Callable[[Picture, NDArray[np.bool_], np.random.Generator], Picture]
 
 UNCHANGED = "unchanged"
-CHANGES: Mapping[str, Change] = {
+CHANGES: Mapping[str, Callable[[Picture, Mask, np.random.Generator], NDArray[Any]]] = {
     UNCHANGED: lambda rgb_HW3, table_HW, rng: rgb_HW3,
-    "light x 0.7": partial(brighten, factor=0.7),
-    "light x 1.25": partial(brighten, factor=1.25),
-    "light gradient 25 %": partial(shade, share=0.25),
-    "noise, sigma 8": partial(add_noise, sigma=8.0),
-    "JPEG, quality 75": partial(compress, quality=75),
-    "wooden table": lay_wood,
+    "light x 0.7": lambda rgb_HW3, table_HW, rng: rgb_HW3 * 0.7,
+    "light x 1.25": lambda rgb_HW3, table_HW, rng: rgb_HW3 * 1.25,
+    "light gradient 25 %": _shade,
+    "noise, sigma 8": lambda rgb_HW3, table_HW, rng: rgb_HW3 + 8 * rng.standard_normal(rgb_HW3.shape),
+    "JPEG, quality 75": _compress,
+    "wooden table": _lay_wood,
 }
-"""Title of a column -> what is done to the observation (H, W, 3), of which `table_HW` shows the table."""
-
-
-def _picture(values_HW3: NDArray[Any]) -> Picture:
-    return values_HW3.round().clip(0, 255).astype(np.uint8)
+"""Title of a column -> what is done to the first picture."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +98,7 @@ class ChangedScene:
         sampled = sample_scene(worker.environment(self.scene), self.scene)
         rgb, labels_HW = sampled.observation["rgb"], sampled.info["segmentation"]
         table_HW = (labels_HW == 0) & (rgb == np.array(sampled.info["palette"]["table"])).all(-1)
-        rng = np.random.default_rng([self.scene.seed, 4])
-        changed = CHANGES[self.change](rgb, table_HW, rng)
+        changed = change_picture(self.change, rgb, table_HW, np.random.default_rng([self.scene.seed, 4]))
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             rollout = worker.world_model.rollout(changed, [sampled.texts[0]], horizon=HORIZON, seed=self.seed)

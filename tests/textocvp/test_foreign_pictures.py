@@ -169,7 +169,7 @@ def test_the_command_line_says_it_in_a_line(capsys, tmp_path: Path, pictures: np
     ]
     assert cli.main(arguments) == 0
     err = capsys.readouterr().err
-    assert err.startswith("textocvp: warning: the observation does not look like") and "(BGR)" in err
+    assert err.startswith("textocvp: warning: the picture does not look like") and "(BGR)" in err
 
 
 def test_thresholds_decide(scene: np.ndarray) -> None:
@@ -177,5 +177,8 @@ def test_thresholds_decide(scene: np.ndarray) -> None:
     model = build(PLACED)
     model.config = replace(model.config, own_frames=OwnFrames(2, 1.0, 1.0))
     assert not said(WorldModel(model), scene)
+    assert "is gray" in said(WorldModel(model), gray(scene))[0]
+    model.config = replace(model.config, own_frames=OwnFrames(2, 1.0, 1.0, gray=True))
+    assert not said(WorldModel(model), gray(scene))
     model.config = replace(model.config, own_frames=OwnFrames(2, 99.0, 99.0))
     assert "another camera, scene or light" in said(WorldModel(model), scene)[0]
