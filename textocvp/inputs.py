@@ -17,7 +17,7 @@ from torch import Tensor
 from textocvp.text.base import TextEncoder
 
 # A picture is foreign where the squared error of its redrawing is four times that of the worst in a hundred of the
-# model's own. For tabletop-small that is below 19.7 dB: 1 of 1,700 own frames is, and all 74 frames of another camera
+# model's own. For tabletop-small that is below 19.7 dB: 1 of 3,800 own frames is, and all 74 frames of another camera
 # and of CLIPort, which reach 14.2 dB at most.
 FOREIGN_DB = 6.0
 # An own picture that is turned upside down is redrawn better by 0.9 dB at most (1,400 frames), a mirrored one by up to
