@@ -84,7 +84,8 @@ def checked_frames(
     H, W = image_size
     if images.dtype != np.uint8:
         in_0_1 = images.dtype.kind == "f" and images.size and 0 <= images.min() <= images.max() <= 1
-        hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)" if in_0_1 else ""
+        hint = "; if its values are 0..255: image.round().astype(np.uint8)"
+        hint = "; it looks like 0..1: (image * 255).round().astype(np.uint8)" if in_0_1 else hint
         raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
     if images.shape[-1] != 3 or images.shape[0] == 0:
         raise ValueError(
