@@ -29,6 +29,7 @@ from experiments.study.frame_metrics import available_measures as available
 from experiments.study.judge import judge_rollout
 from experiments.study.mask_metrics import labels_of, score_masks
 from experiments.study.methods import BASELINES, HORIZON, METHODS, PLANNERS, TRAINED_LITTLE, Model, lines
+from experiments.study.pictures import CHANGES, ChangedScene, change_rows, change_tables
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
@@ -60,18 +61,23 @@ class Sizes:
     imagined: int  # for frames and masks
     loop: int  # for the closed loop, ours and the expert
     controls: int  # for every other planner
+    changed: int  # for every change of light or camera; of the test set only
     clips: int  # how many best and how many worst cases are shown
     acted: int  # how many episodes of the robot are shown
 
 
-QUICK = Sizes(imagined=5, loop=8, controls=4, clips=3, acted=2)
-DEFAULT = Sizes(imagined=50, loop=50, controls=25, clips=10, acted=6)
+QUICK = Sizes(imagined=5, loop=8, controls=4, changed=8, clips=3, acted=2)
+DEFAULT = Sizes(imagined=50, loop=50, controls=25, changed=40, clips=10, acted=6)
 
 
 def sizes_of(args: ScenesArgs) -> Sizes:
     """How much a command line asks for."""
     sizes, most = QUICK if args.quick else DEFAULT, args.scenes
-    return replace(sizes, imagined=most, loop=most, controls=min(most, sizes.controls)) if most else sizes
+    return (
+        replace(sizes, imagined=most, loop=most, controls=min(most, sizes.controls), changed=most)
+        if most
+        else sizes
+    )
 
 
 # --- units of work ----------------------------------------------------------------------------------------------------
@@ -142,9 +148,15 @@ def units(run: Run) -> dict[str, Part]:
         for method in ACTING
         if method in ("ours", "expert") or i < sizes.controls
     ]
+    changed = [
+        ChangedScene(scene, change, seed)
+        for scene in study_scenes(REFERENCE, sizes.changed, seed)
+        for change in CHANGES
+    ]
     return {
         "frames and masks": Part(scenes, 2.8),
         "closed loop": Part(episodes, 0.25),
+        "other light": Part(changed, 0.04),
         "imagined clips": Part(seconds=1.4, count=2 * min(sizes.clips, sizes.imagined)),
         "robot clips": Part(seconds=0.3, count=sizes.acted),
     }
@@ -238,7 +250,7 @@ def rows(run: Run, found: Found) -> list[Row]:
         for o in found["closed loop"]
     )
     first, last = ([row for one in its.items() for row in rows_of(*one)] for its in (imagined, acted))
-    return [*first, *difference_rows(imagined), *last]
+    return [*first, *difference_rows(imagined), *last, *change_rows(found["other light"])]
 
 
 def headline(run: Run) -> dict[str, Key]:
@@ -363,6 +375,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     best, worst = best_and_worst(found["imagined clips"])
     ranked = f"By whether ours shows what was asked, then by its {name} at {LENGTHS[-1]} frames."
     watched = "Failures where there are any. Left: each chosen plan, imagined. Right: the camera."
+    light = "The test set's first pictures, changed. The true masks say which slots are block and bowl."
     judged = "Dots with 95 % intervals over scenes, judged by the simulator."
     return [
         Section(
@@ -381,6 +394,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             Section(SPLITS[s].capitalize(), text, [spec.table(figures, missing) for spec in SPLIT_TABLES[s]])
             for s, text in texts.items()
         ),
+        Section("Other light", light, [spec.table(figures, missing) for spec in change_tables(REFERENCE)]),
         Section("The best cases", f"{ranked} Below: masks, one colour a thing.", [Clips(best)]),
         Section("The worst cases", ranked, [Clips(worst)]),
         Section("Planned beside executed", watched, [Clips(found["robot clips"])]),
@@ -417,7 +431,7 @@ STUDY = Study(
     units=units,
     cases=cases,
     rows=rows,
-    tables=[*SHORT_TABLES, LOOP_TABLE],
+    tables=[*SHORT_TABLES, LOOP_TABLE, *change_tables(REFERENCE)],
     printed=lambda run, results: [bars_table(results, run.measures)],
     page=page,
     cards=cards,

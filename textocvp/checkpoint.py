@@ -161,7 +161,14 @@ def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) 
     # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
     save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
-    (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    write_config(folder, config)
+
+
+def write_config(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write `config.json` into `folder`; an old one stays whole until the new one is."""
+    new = folder / f"{CONFIG_FILE}.new"
+    new.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    new.replace(folder / CONFIG_FILE)
 
 
 def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:

@@ -1,11 +1,11 @@
-"""The command line: `textocvp train`, `textocvp rollout`, `textocvp models`, `textocvp info`."""
+"""The command line: `textocvp train`, `rollout`, `models`, `info` and `measure`."""
 
 from __future__ import annotations
 
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -27,6 +27,7 @@ from textocvp.checkpoint import (
     read_config,
     read_json,
     resolve_checkpoint,
+    write_config,
 )
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
@@ -91,11 +92,25 @@ class InfoCommand:
     """A bundled name, a folder, or a Hugging Face hub id owner/name."""
 
 
+@dataclass
+class MeasureCommand:
+    """Measure how well a checkpoint redraws its world, and note it in its config.json.
+
+    From then on the model warns about pictures that are redrawn far worse. Stage 1 of training does the same.
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    """Folder with config.json, which is changed, and model.safetensors, which is not."""
+    val: Path
+    """Held-out episodes of its world, as for training; their first frames count."""
+
+
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
     Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
+    Annotated[MeasureCommand, tyro.conf.subcommand("measure")],
 ]
 
 
@@ -127,6 +142,8 @@ def _run(arguments: list[str]) -> None:
     )
     if isinstance(command, RolloutCommand):
         _rollout(command)
+    elif isinstance(command, MeasureCommand):
+        _measure(command)
     elif isinstance(command, ModelsCommand):
         _models()
     else:
@@ -212,6 +229,26 @@ def _rollout(command: RolloutCommand) -> None:
         raise Mistake(str(error)) from error
     print(imagined)
     print(f"wrote {imagined.save(command.out)}")
+
+
+def _measure(command: MeasureCommand) -> None:
+    # Imported here because training brings libraries that take seconds to load.
+    from textocvp.data import open_episodes
+    from textocvp.training.evaluate_parser import measure_own_frames
+
+    folder = command.checkpoint
+    if not folder.is_dir():
+        raise Mistake(f"there is no folder {folder}: give that of a checkpoint")
+    model = TextOCVP.from_pretrained(folder)
+    try:
+        with open_episodes(command.val) as held_out:
+            if (size := held_out.image_size) != (own_size := model.config.parser.image_size):
+                raise Mistake(f"{command.val} has frames of {size} pixels, the model takes {own_size}")
+            own = measure_own_frames(model, held_out)
+    except (OSError, ValueError) as error:
+        raise Mistake(str(error)) from error
+    write_config(folder, read_json(folder) | {"own_frames": asdict(own)})
+    print(f"wrote {folder / CONFIG_FILE}: {own}")
 
 
 def _info(command: InfoCommand) -> None:

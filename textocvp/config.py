@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from textocvp.inputs import OwnFrames
 from textocvp.parsers import PARSERS, ParserConfig
 from textocvp.parsers.placed import PlacedConfig
 from textocvp.predictors import PREDICTORS, PredictorConfig
@@ -42,6 +43,8 @@ class ModelConfig:
     predictor: PredictorConfig = field(default_factory=TextOCVPConfig)
     # The last stage of training that it has been through. After `parser`, text encoder and predictor are as drawn.
     stage: Literal["parser", "predictor"] = "predictor"
+    # What pictures of its world are like, for a warning about others; None where nobody measured it.
+    own_frames: OwnFrames | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, ready for JSON."""
@@ -81,8 +84,10 @@ def build(cls: type[C], data: Any, path: str = "") -> C:
                 raise ValueError(f"{where} is missing")
         elif name in kinds:
             values[name] = build(config_class(kinds[name], data[name], where), data[name], where)
-        elif is_dataclass(hints[name]):
-            values[name] = build(hints[name], data[name], where)
+        elif data[name] is None and type(None) in get_args(hints[name]):
+            values[name] = None
+        elif nested := [hint for hint in (hints[name], *get_args(hints[name])) if is_dataclass(hint)]:
+            values[name] = build(nested[0], data[name], where)  # type: ignore[arg-type]
         else:
             values[name] = _checked(data[name], hints[name], where)
     return cls(**values)

@@ -20,9 +20,11 @@ from textocvp.inputs import (
     checked_texts,
     observed_images,
     times_larger,
+    warn_of_foreign,
 )
+from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
-from textocvp.rollout import Rollout
+from textocvp.rollout import CHUNK, Rollout
 
 __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
 
@@ -111,6 +113,8 @@ class WorldModel:
 
         Warns:
             UserWarning: if the text encoder does not know a word, which is named, or if the predictor is untrained.
+            ForeignPictureWarning: a UserWarning, if the observation does not look like the pictures that the model was
+                trained on; the likely cause is named.
         """
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
@@ -152,6 +156,9 @@ class WorldModel:
 
         Raises:
             TypeError, ValueError: as `rollout`.
+
+        Warns:
+            ForeignPictureWarning: if a first frame does not look like the pictures that the model was trained on.
         """
         frames = np.asarray(video)
         if frames.ndim not in (4, 5):
@@ -159,7 +166,9 @@ class WorldModel:
         B, T = frames.shape[:-3] if frames.ndim == 5 else (1, len(frames))
         images = frames.reshape(-1, *frames.shape[-3:])
         frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video", multiples=True)
-        return self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
+        parsed = self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
+        self._warn_of_foreign(frames_N3HW[::T], parsed, seed, num_slots, depth=3)
+        return parsed
 
     def words(self, text: str) -> list[str]:
         """A sentence as the text encoder splits it: what the last axis of `Rollout.attention` stands for."""
@@ -170,11 +179,9 @@ class WorldModel:
     def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Rollout:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
-        model, (H, W) = self.model, self.image_size
+        model = self.model
         generator = torch.Generator(device=model.device).manual_seed(seed)
-        own_BT3HW = F.adaptive_avg_pool2d(frames_BT3HW.flatten(0, 1), (H, W)).unflatten(
-            0, frames_BT3HW.shape[:2]
-        )
+        own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
         parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generator)
         slots_BTKD = parsed.slots_BTKD.float()
         seen = model.renderer.remember(frames_BT3HW[:, 0], parsed.attention_BTKHW[:, 0], slots_BTKD[:, 0])
@@ -197,4 +204,27 @@ class WorldModel:
                 )
             return obs
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device, multiples=True)
-        return self._parsed(frames_B3HW[:, None], seed, num_slots)
+        parsed = self._parsed(frames_B3HW[:, None], seed, num_slots)
+        self._warn_of_foreign(frames_B3HW, parsed, seed, num_slots, depth=4)
+        return parsed
+
+    def _warn_of_foreign(
+        self, frames_B3HW: Tensor, parsed: Rollout, seed: int, num_slots: int | None, depth: int
+    ) -> None:
+        """Redraw the pictures that a rollout begins with, and warn where they are not of the model's world."""
+        own = self.model.config.own_frames
+        if own is None or parsed.slots.shape[2] < self.model.config.parser.num_slots:
+            return  # too few slots redraw nothing well
+
+        def psnr_of(frames_B3HW: Tensor, slots_BKD: Tensor | None = None) -> Tensor:
+            if slots_BKD is None:
+                slots_BKD = self._parsed(frames_B3HW[:, None], seed, num_slots).slots[:, 0]
+            # Without the first frame in mind: pixels that are carried along say nothing of the model.
+            drawn = [self.model.renderer(part).frames_B3HW for part in slots_BKD.split(CHUNK)]
+            return psnr((torch.cat(drawn).clamp(-1, 1) + 1) / 2, (frames_B3HW + 1) / 2)
+
+        own_B3HW = self._at_own_size(frames_B3HW)
+        warn_of_foreign(own_B3HW, psnr_of(own_B3HW, parsed.slots[:, 0]), own, psnr_of, depth=depth + 1)
+
+    def _at_own_size(self, frames_N3HW: Tensor) -> Tensor:
+        return F.adaptive_avg_pool2d(frames_N3HW, self.image_size)

@@ -27,16 +27,20 @@ class StudyScene:
     # for `reset`; sorted items, so that a scene can be compared and hashed
     options: tuple[tuple[str, Any], ...]
     steps: int = 1  # pairs of the goal
+    world: tuple[
+        tuple[str, Any], ...
+    ] = ()  # more arguments of the environment, as its scene and picture size
 
     def make(self) -> gym.Env[Any, Any]:
         """The environment it is played in, which records the frames of its motions."""
+        asked: dict[str, Any] = {"control": "primitive", "record_frames": True, **dict(self.world)}
         if self.steps == 1:
-            return gym.make("PutBlockInBowl-v0", control="primitive", record_frames=True)
-        return gym.make("PutBlocksInBowls-v0", control="primitive", record_frames=True, n_pairs=self.steps)
+            return gym.make("PutBlockInBowl-v0", **asked)
+        return gym.make("PutBlocksInBowls-v0", n_pairs=self.steps, **asked)
 
 
-def study_scenes(split: str, count: int, seed: int) -> list[StudyScene]:
-    """`count` scenes of a split; each `seed` chooses other ones.
+def study_scenes(split: str, count: int, seed: int, **world: Any) -> list[StudyScene]:
+    """`count` scenes of a split, in a `world`; each `seed` chooses other ones.
 
     Raises:
         ValueError: if there is no such split.
@@ -52,7 +56,9 @@ def study_scenes(split: str, count: int, seed: int) -> list[StudyScene]:
     for i in range(count):
         one = source.seed(SCENES_PER_SEED * seed + first + i)
         options = source.options(one) if steps == 1 else {"n_objects": 6, "color_split": "seen"}
-        scenes.append(StudyScene(split, one, tuple(sorted(options.items())), steps))
+        scenes.append(
+            StudyScene(split, one, tuple(sorted(options.items())), steps, tuple(sorted(world.items())))
+        )
     return scenes
 
 

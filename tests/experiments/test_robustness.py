@@ -31,6 +31,7 @@ from experiments.robustness import (
 )
 from experiments.study.frame_metrics import Measures
 from experiments.study.methods import Model
+from experiments.study.pictures import CHANGES
 from experiments.study.pool import Worker
 from experiments.study.run import Run, ScenesArgs, run
 from experiments.study.scenes import study_scenes
@@ -99,7 +100,7 @@ def test_worst_cases_are_failures_first_and_never_of_the_test_set(tmp_path: Path
         outcome("more_objects", 0, 0.8, False),
         outcome("more_objects", 1, 0.7, True),
     ]
-    sizes = Sizes(imagined=2, loop=0, controls=0, clips=2, acted=0)
+    sizes = Sizes(imagined=2, loop=0, controls=0, changed=0, clips=2, acted=0)
     this = Run(STUDY, ScenesArgs(out=tmp_path), load=LoadOracle(), sizes=sizes, loads={}, measures=BARE)
     clips = cases(this, {"frames and masks": outcomes, "closed loop": []})["imagined clips"]
     shown = [(clip.best, clip.scene.split, clip.good) for clip in clips]  # type: ignore[attr-defined]
@@ -172,7 +173,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         STUDY,
         ScenesArgs(out=out, quick=True, workers=1),
         load=LoadOracle(),
-        sizes=Sizes(imagined=1, loop=1, controls=1, clips=1, acted=2),
+        sizes=Sizes(imagined=1, loop=1, controls=1, changed=1, clips=1, acted=2),
         loads={"MAGE": LoadStill(24)},
         measures=ST_LPIPS,
     )
@@ -189,6 +190,8 @@ def test_the_study_as_a_whole(folder: Path) -> None:
     assert [found.headline[f"closed_loop_{split}"] for split in SPLITS] == [1.0, 1.0, 1.0]
     by_split = {r.split for r in found.rows if r.metric == "closed_loop_success" and r.method == "expert"}
     assert by_split == set(SPLITS)
+    changed = [row for row in found.rows if row.metric == "reached"]
+    assert [row.variant for row in changed] == list(CHANGES) and {row.value for row in changed} == {1.0}
     test, unseen = (found.find("ours", "9 frames", "st_lpips", s) for s in ("test", "unseen_colors"))
     assert test is not None and unseen is not None
     assert found.headline["lpips_drop_unseen_colors"] == pytest.approx(

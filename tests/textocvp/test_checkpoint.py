@@ -130,6 +130,28 @@ def test_an_impossible_config_value_is_named(folder: Path) -> None:
         TextOCVP.from_pretrained(folder)
 
 
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (3, r"own_frames must be a group of fields, not 3"),
+        ({"count": 2, "psnr": 30.0}, r"own_frames\.psnr_low is missing"),
+        ({"count": 2, "psnr": "30", "psnr_low": 20.0}, r"own_frames\.psnr is '30'"),
+        ({"count": 2, "psnr": 30.0, "psnr_low": 20.0, "hue": "blue"}, r"own_frames\.hue is 'blue'"),
+    ],
+)
+def test_figures_of_own_frames_are_checked(folder: Path, value: object, says: str) -> None:
+    change_config(folder, own_frames=value)
+    with pytest.raises(CheckpointError, match=rf"config\.json: {says}"):
+        TextOCVP.from_pretrained(folder)
+
+
+def test_a_checkpoint_without_figures_of_own_frames_loads(folder: Path) -> None:
+    data = json.loads((folder / "config.json").read_text())
+    assert data.pop("own_frames") is None
+    (folder / "config.json").write_text(json.dumps(data))
+    assert TextOCVP.from_pretrained(folder).config.own_frames is None
+
+
 @pytest.mark.parametrize("text", ["{", "[1, 2]", "", "\x00"])
 def test_a_damaged_config_is_an_error_about_that_file(folder: Path, text: str) -> None:
     (folder / "config.json").write_text(text)

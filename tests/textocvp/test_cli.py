@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 import sys
+from importlib.resources import files
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -146,6 +148,26 @@ def test_help_teaches(capsys, arguments, parts) -> None:
     assert stop.value.code == 0
     printed = capsys.readouterr().out
     assert all(part in printed for part in parts)
+
+
+def test_figures_of_own_frames_are_added_and_nothing_else_changes(capsys, tmp_path, checkpoint) -> None:
+    folder, val = Path(checkpoint), write_toy_episodes(tmp_path / "val.h5", [4, 5, 4])
+    before, weights = (
+        json.loads((folder / "config.json").read_text()),
+        (folder / "model.safetensors").read_bytes(),
+    )
+    assert cli.main(["measure", checkpoint, "--val", str(val)]) == 0
+    after = json.loads((folder / "config.json").read_text())
+    assert after["own_frames"]["count"] == 3 and str(folder / "config.json") in capsys.readouterr().out
+    assert {**after, "own_frames": None} == before and list(after) == list(before)
+    assert (folder / "model.safetensors").read_bytes() == weights
+    message = says(capsys, ["measure", "tabletop-small", "--val", str(val)], 1)
+    assert "no folder tabletop-small" in message
+    message = says(capsys, ["measure", checkpoint, "--val", str(tmp_path / "none.h5")], 1)
+    assert "envs.collect" in message
+    bundled = str(files("textocvp") / "checkpoints" / "tabletop-small")
+    message = says(capsys, ["measure", bundled, "--val", str(val)], 1)
+    assert "frames of 32 pixels, the model takes 64" in message
 
 
 def test_wrong_options_exit_with_two(capsys) -> None:

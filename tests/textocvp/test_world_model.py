@@ -132,7 +132,7 @@ def test_videos_are_parsed_one_or_many(world_model: WorldModel, scene: np.ndarra
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
-        (lambda s: s.astype(np.float32), TypeError, "uint8 .* not float32"),
+        (lambda s: s.astype(np.float32), TypeError, r"uint8 .* not float32; .* image\.round\(\)\.astype"),
         (lambda s: s / 255.0, TypeError, r"\(image \* 255\)"),
         (lambda s: s.astype(np.int64), TypeError, "int64"),
         (lambda s: (s > 50).astype(np.uint8), ValueError, "only the values 0 and 1"),

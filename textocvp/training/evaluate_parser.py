@@ -12,8 +12,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from textocvp.data.episodes import Episodes
+from textocvp.inputs import DARK, HUE_REACH, HUE_SHARE, OwnFrames, are_gray, hue_shares
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.metrics.masks import MIN_PIXELS
 from textocvp.model import TextOCVP
@@ -124,6 +126,40 @@ def measure_parser(
         for values in (ious, found, follows, aris, robots)
     )
     return ParserMetrics(miou, share, kept, ari, bootstrap_interval(psnrs), robot, "" if ious else left_out)
+
+
+@torch.no_grad()
+def measure_own_frames(model: TextOCVP, episodes: Episodes) -> OwnFrames:
+    """How the model redraws the first frames of held-out episodes: what a checkpoint stores to tell others by."""
+    psnrs, shares, hues_C3, gray = [], [], None, False
+    for at in range(0, len(episodes), 16):
+        frames_B3HW = to_frames(episodes.clips(episodes.starts[at : at + 16], 1), model.device)[:, 0]
+        values_B3HW = (frames_B3HW + 1) * 127.5
+        if hues_C3 is None:
+            hues_C3 = _hues(values_B3HW[0])  # what nearly all frames show, the first one does
+        seeded = torch.Generator(model.device).manual_seed(0)
+        slots_BKD = model.parser(frames_B3HW[:, None], generator=seeded).slots_BTKD[:, 0]
+        drawn_B3HW = model.renderer(slots_BKD).frames_B3HW.clamp(-1, 1)
+        psnrs.append(psnr((drawn_B3HW + 1) / 2, (frames_B3HW + 1) / 2).cpu())
+        shares.append(hue_shares(values_B3HW, hues_C3).cpu())
+        gray |= bool(are_gray(values_B3HW).any())
+    psnr_E, low_C = torch.cat(psnrs), torch.cat(shares).quantile(0.01, 0)
+    hue = ""
+    if hues_C3 is not None and low_C.amax() >= HUE_SHARE:
+        hue = bytes((255 * hues_C3[low_C.argmax()]).round().int().tolist()).hex()
+    mean, low = psnr_E.mean().item(), psnr_E.quantile(0.01).item()
+    return OwnFrames(len(psnr_E), round(mean, 2), round(low, 2), hue, gray)
+
+
+def _hues(values_3HW: Tensor, most: int = 64) -> Tensor:
+    """(C, 3) the commonest hues of a picture that are others where red and blue change places; pure blue at least."""
+    pixels_N3 = values_3HW.flatten(1).T
+    pixels_N3 = pixels_N3[pixels_N3.amax(1) >= DARK]
+    hues_N3 = pixels_N3 / pixels_N3.amax(1, keepdim=True)
+    hues_N3 = hues_N3[(hues_N3[:, 0] - hues_N3[:, 2]).abs() > 2 * HUE_REACH]
+    hues_C3, count_C = (hues_N3 / HUE_REACH * 2).round().unique(dim=0, return_counts=True)
+    commonest_C3 = hues_C3[count_C.argsort(descending=True)[:most]] * HUE_REACH / 2
+    return torch.cat([commonest_C3, hues_N3.new_tensor([[0.0, 0.0, 1.0]])])
 
 
 def _ious(

@@ -24,10 +24,11 @@ from textocvp.config import with_settings
 from textocvp.data.episodes import Episodes
 from textocvp.drawing import color_masks
 from textocvp.model import TextOCVP
+from textocvp.parsers.votes import VotesParser
 from textocvp.presets import preset
 from textocvp.slots import SlotState
 from textocvp.training.clips import ClipTraining, clip_reader, save_samples, to_pictures
-from textocvp.training.evaluate_parser import ParserMetrics, measure_parser
+from textocvp.training.evaluate_parser import ParserMetrics, measure_own_frames, measure_parser
 from textocvp.training.losses import (
     ParserLoss,
     image_loss,
@@ -174,7 +175,12 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                 run.backward(total, vars(loss))
             run.update(step)
             run.evaluate(step, measure, lambda path: draw_samples(model, held_out, path))
-        metrics = run.finish(model.save_pretrained, measure, "quality.json")
+
+        def save(folder: Path) -> None:
+            model.config = replace(model.config, own_frames=measure_own_frames(model, held_out))
+            model.save_pretrained(folder)
+
+        metrics = run.finish(save, measure, "quality.json")
         for sentence in metrics.below_threshold() if metrics is not None else ():
             print(f"not good enough to train a predictor on: {sentence}")
     close_run(accelerator)
@@ -187,12 +193,12 @@ def keep_taught(model: TextOCVP, checkpoint: Path) -> None:
     Raises:
         SettingsError: if the parser is none that is taught, or its network has other sizes.
     """
-    if not model.parser.taught:
-        raise SettingsError("taught is for parsers that are: set parser.kind=votes")
     source = TextOCVP.from_pretrained(str(checkpoint)).parser
+    if not isinstance(model.parser, VotesParser) or not isinstance(source, VotesParser):
+        raise SettingsError("taught is for parsers that are, in preset and checkpoint: parser.kind=votes")
     try:
         model.parser.network.load_state_dict(source.network.state_dict())
-    except (AttributeError, RuntimeError) as error:
+    except RuntimeError as error:
         raise SettingsError(f"the parser of {checkpoint} has another network: {error}") from error
     model.parser.network.requires_grad_(False)
 

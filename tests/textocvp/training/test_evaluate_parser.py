@@ -13,7 +13,7 @@ from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.data.episodes import EpisodeFile
 from textocvp.metrics.intervals import Interval
 from textocvp.renderers.base import Rendered
-from textocvp.training.evaluate_parser import ParserMetrics, measure_parser
+from textocvp.training.evaluate_parser import ParserMetrics, measure_own_frames, measure_parser
 
 
 @pytest.fixture
@@ -42,6 +42,24 @@ def test_masks_of_nothing_are_left_out(val: Path) -> None:
         alone = measure_parser(build(PLACED), episodes, [0])
     assert alone.object_miou is None and "no masks" in alone.left_out
     assert set(alone.as_metrics()) == {"quality/psnr"}
+
+
+def test_own_frames_are_the_first_ones(val: Path) -> None:
+    with EpisodeFile(val) as episodes:
+        before = measure_own_frames(build(PLACED), episodes)
+    with h5py.File(val, "a") as file:
+        file["frames"][1:9] = 0  # later ones do not count
+    with EpisodeFile(val) as episodes:
+        assert measure_own_frames(build(PLACED), episodes) == before
+    assert before.count == 2 and before.hue and not before.gray
+
+
+def test_gray_videos_have_no_hue(val: Path) -> None:
+    with h5py.File(val, "a") as file:
+        file["frames"][:] = file["frames"][:].mean(-1, keepdims=True).astype("uint8")
+    with EpisodeFile(val) as episodes:
+        own = measure_own_frames(build(PLACED), episodes)
+    assert own.hue == "" and own.gray
 
 
 def test_thresholds_name_what_is_not_good_enough() -> None:

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED
-from tests.textocvp.toy_episodes import write_toy_episodes
-from tests.textocvp.training.runs import parser_run, same_weights, train, train_killed_after
+from tests.textocvp.toy_episodes import COLORS, write_toy_episodes
+from tests.textocvp.training.runs import (
+    parser_run,
+    predictor_run,
+    same_weights,
+    train,
+    train_killed_after,
+)
 from textocvp.data.episodes import EpisodeFile
+from textocvp.metrics import psnr
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
+from textocvp.training.evaluate_parser import measure_own_frames
 from textocvp.training.losses import thing_weights
 from textocvp.training.parser import ParserStage, ParserTraining
 from textocvp.training.run import SettingsError
+from textocvp.world_model import WorldModel
 
 
 def placed_run(folder: Path, out: str, **changes) -> ParserTraining:
@@ -74,6 +85,35 @@ def test_frames_and_captions_are_enough(folder: Path, capsys: pytest.CaptureFixt
     printed = capsys.readouterr().out
     assert printed.count("the held-out episodes have no masks: only the redrawn frames are measured") == 3
     assert [path.name for path in sorted((args.out / "samples").iterdir())] == ["000001.png", "000002.png"]
+
+
+def test_a_checkpoint_knows_how_it_redraws_its_own_frames_and_keeps_that(folder: Path) -> None:
+    """From stage 1 through stage 2, fine-tuning, saving and loading."""
+    args = placed_run(folder, "out", steps=1)
+    train(args)
+    first = args.out / "checkpoint"
+    own = TextOCVP.from_pretrained(first).config.own_frames
+    with EpisodeFile(args.val) as episodes:
+        frames = np.stack([episodes.frames(index)[0] for index in range(len(episodes))])
+        assert own == measure_own_frames(TextOCVP.from_pretrained(first), episodes)
+    redrawn = WorldModel.from_pretrained(first).parse(frames[:, None]).frames[:, 0]
+    real = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
+    assert own.count == 2 and own.psnr == pytest.approx(psnr(redrawn, real).mean().item(), abs=0.01)
+    hue, yellow = (
+        np.array(list(bytes.fromhex(own.hue))),
+        np.array(COLORS["yellow"]),
+    )  # the largest that all show
+    assert own.psnr_low <= own.psnr and abs(hue - 255 * yellow / yellow.max()).max() < 4
+    second, third = (
+        predictor_run(folder, "second", parser=first),
+        predictor_run(folder, "third", finetune=True),
+    )
+    train(second)
+    train(replace(third, parser=second.out / "checkpoint"))
+    for out in (second.out, third.out):
+        assert TextOCVP.from_pretrained(out / "checkpoint").config.own_frames == own
+    TextOCVP.from_pretrained(third.out / "checkpoint").save_pretrained(folder / "again")  # as for the hub
+    assert TextOCVP.from_pretrained(folder / "again").config.own_frames == own
 
 
 def test_clips_longer_than_every_episode_are_refused(folder: Path) -> None:

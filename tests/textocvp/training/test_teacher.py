@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.textocvp.conftest import VOTES
 from tests.textocvp.toy_episodes import write_toy_episodes
-from tests.textocvp.training.runs import losses, parser_run, same_weights, train, train_killed_after
+from tests.textocvp.training.runs import losses, parser_run, same_weights, train, train_killed_after, weights
 from textocvp.data.episodes import EpisodeFile
 from textocvp.presets import PRESETS
 from textocvp.training.light import relight
@@ -112,3 +114,21 @@ def test_a_teacher_without_masks_says_so(tmp_path: Path) -> None:
     path = write_toy_episodes(tmp_path / "toy.h5", [9], truth=False)
     with EpisodeFile(path) as episodes, pytest.raises(ValueError, match="has no masks to teach with"):
         Teacher("masks", episodes).labels(np.array([0]), episodes.clips(np.array([0]), 1), 1)
+
+
+def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PRESETS, VOTES.name, VOTES)
+    settings = dict(preset=VOTES.name, steps=2, batch=3, clip=1)
+    lesson = parser_run(folder, "lesson", first_redraw=2, **settings)
+    train(lesson)
+    taken = parser_run(folder, "taken", taught=lesson.out / "checkpoint", seed=1, **settings)
+    train(taken)
+    before, after = weights(lesson.out), weights(taken.out)
+    network = [name for name in before if name.startswith("parser.network.")]
+    assert network and all(torch.equal(before[name], after[name]) for name in network)
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed >= {"parser", "renderer"}  # what its slots hold, and how they are drawn
+    with pytest.raises(SettingsError, match="parser.kind=votes"):
+        train(parser_run(folder, "other", preset="tabletop-small", taught=lesson.out / "checkpoint"))
+    with pytest.raises(SettingsError, match="has another network"):
+        train(replace(taken, out=folder / "wide", set=("parser.channels=8",)))
