@@ -47,25 +47,25 @@ class Expert:
     def search(self, budget: int = 40) -> tuple[GoalPair, ...]:
         """Sentences that lead to the goal of a `RearrangeBlocks-v0`, tried in a copy of the scene.
 
-        What sentences should lead to is searched first. A plan that leads elsewhere in the copy is forgotten, and
-        where it led is learnt. When ``budget`` sentences were tried in vain, the last plan; with no plan at all, none.
+        A plan is searched by what its sentences should lead to, and then tried. Where one leads elsewhere, that is
+        kept in mind and a new plan is made, until one succeeds or ``budget`` sentences were tried. Then it is what was
+        tried last; with no plan at all, nothing.
         """
         env, task = self._env, self._env.task
         assert isinstance(task, Rearrange)
         surprises: dict[tuple[Supports, GoalPair], Supports] = {}
-        start, plan = supports(env.world, env.robot), None
-        twin = env.copy()
-        expert = Expert(twin)
+        start, plan, twin = supports(env.world, env.robot), None, env.copy()
         while budget > 0 and (plan := task.solve(env.scene, start, surprises)):
-            state = start
+            state, tried = start, 0
             for sentence in plan:
-                for action in expert._play((sentence,)):
+                for action in Expert(twin)._play((sentence,)):
                     twin.step(action)
-                before, state, budget = state, supports(twin.world, twin.robot), budget - 1
+                before, state, tried = state, supports(twin.world, twin.robot), tried + 1
                 if state != surprises.get((before, sentence), arrangement_after(before, sentence)):
                     surprises[before, sentence] = state
                     break
-            if task.succeeded(twin.world, twin.robot, twin.scene):
+            budget, plan = budget - tried, plan[:tried]
+            if task.succeeded(twin.world, twin.robot, env.scene):
                 break
             twin.follow(env)
         twin.close()

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from envs.checks import check_choice, check_range
 from envs.factors import Factors
 from envs.options import read_options
-from envs.physics.motion import Action, pick_and_place
 from envs.physics.arm import Joints
+from envs.physics.motion import Action, pick_and_place
 from envs.physics.recorder import Recorder
 from envs.physics.robot import Robot
 from envs.physics.simulation import FIRST_OBJECT, Tabletop
@@ -26,6 +26,7 @@ from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primi
 from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
+Control = Literal["primitive", "ee"]
 EE_SECONDS = 5 / 3  # time for each attempt in "ee" mode; a pick-and-place takes 1.6 s
 MAX_SETTLE_STEPS = 120
 
@@ -68,8 +69,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in
     this scene, see `envs.factors.Factors`), `supports` (n,) (what carries each object: its id, -1 the table, -2
     nothing, see `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` also has `relations` (of each goal pair
-    its name), `family` (of the scene, or None) and `goal_supports` (n,), of a goal picture, or None. With ``record_frames=True`` also `frames`,
-    `frame_segmentations` and `frame_states` of this step or of `reset`: see `envs.physics.recorder.Recorder`.
+    its name), `family` (of the scene, or None) and `goal_supports` (n,), of a goal picture, or None. With
+    ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of `reset`: see
+    `envs.physics.recorder.Recorder`.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -90,7 +92,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             view) or "varied" (the same with random factors).
         task: a name of `envs.tasks.TASKS`, or a task of your own.
         n_pairs: how many pairs a random goal has; by default the task's fewest. A given instruction may name
-            1 to the task's most.
+            1 to the task's most. In `RearrangeBlocks-v0` the family says it.
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
         camera: "close" (a narrow workspace fills the frame) or "paper"; by default the scene's own.
@@ -114,7 +116,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self,
         task: str | Task = "put_block_in_bowl",
         n_pairs: int | None = None,
-        control: Literal["primitive", "ee"] = "primitive",
+        control: Control = "primitive",
         image_size: int = 64,
         camera: str | None = None,
         object_scale: float = 1.0,
@@ -129,11 +131,6 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         sizes: str | None = None,
         factors: Factors | None = None,
     ) -> None:
-        # Of a copy, which need not draw what it does.
-        shown = {"image_size": 16, "record_frames": False, "render_mode": None}
-        self._copy_arguments = {
-            k: v for k, v in locals().items() if k not in ("self", "__class__", "shown")
-        } | shown
         if isinstance(task, str):
             check_choice("task", task, TASKS)
         self.task = TASKS[task] if isinstance(task, str) else task
@@ -150,7 +147,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
         if max_steps is not None:
             check_range("max_steps", max_steps, 1, 10**9, whole=True)
-        self.control, self.render_mode = control, render_mode
+        self.control, self.render_mode, self.scene_name = control, render_mode, scene
         self.extras, self.place_yaw, self.record_frames = tuple(extras), place_yaw, record_frames
         frames = 1 if control == "primitive" else EE_SECONDS * physics_hz / render_stride
         self.max_steps = max_steps or round(self.task.attempts * frames) * self.n_pairs
@@ -167,19 +164,17 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.robot)
-        self._scene: Scene | None = None
-        self._start: tuple[Setup, Scene, Joints] | None = None
+        self._start: tuple[Setup, Scene, Joints] | None = None  # what was built
         self._actions: list[NDArray[np.float32]] = []  # since the reset
         self._goal_rgb = np.zeros((image_size, image_size, 3), np.uint8)
         self._drawn: dict[str, Any] = {}
-        self._elapsed = 0
 
     @property
     def scene(self) -> Scene:
         """The scene as it was built, for experts; gymnasium.error.ResetNeeded before the first reset."""
-        if self._scene is None:
+        if self._start is None:
             raise gym.error.ResetNeeded("call reset() first")
-        return self._scene
+        return self._start[1]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -232,11 +227,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._move(values)
         if not self._recorder.images:
             self._recorder.capture()
-        self._elapsed += 1
         after = self._fulfilled()
         reward = (sum(after) - sum(before)) / len(after)
         terminated = self.task.succeeded(self.world, self.robot, self.scene) and self.robot.is_home
-        return self._observe(), reward, terminated, self._elapsed >= self.max_steps, self._info()
+        return self._observe(), reward, terminated, len(self._actions) >= self.max_steps, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
         """The newest camera frame (H, W, 3) with "rgb_array"; the window shows itself with "human"."""
@@ -246,19 +240,31 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         return self._recorder.images[-1].rgb.copy() if self.render_mode == "rgb_array" else None
 
     def copy(self) -> TabletopEnv:
-        """A small-pictured environment with a simulator of its own in this one's state; see `follow`."""
-        twin = TabletopEnv(**self._copy_arguments)
+        """The same scene in the same state in a simulator of its own, to try things; its pictures are tiny."""
+        twin = TabletopEnv(
+            self.task,
+            control=self.control,
+            image_size=16,
+            render_stride=self.robot.frame_steps,
+            physics_hz=self.world.physics_hz,
+            place_yaw=self.place_yaw,
+            scene=self.scene_name,
+        )
         twin.follow(self)
         return twin
 
-    def follow(self, other: TabletopEnv) -> None:
+    def follow(self, original: TabletopEnv) -> None:
         """Come to the state of the environment that this one is a copy of, to the last bit.
 
-        By building its scene and repeating its actions: PyBullet's own saved states are not exact.
+        Its scene is built and its actions are repeated, because PyBullet's own saved states are not exact.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the original's first reset.
         """
-        _, self._drawn, actions = other.scene, other._drawn, list(other._actions)
-        assert other._start is not None
-        self._build(*other._start)
+        scene, actions = original.scene, original._actions
+        assert original._start is not None
+        setup, _, joints = original._start
+        self._build(setup, scene, joints)
         for action in actions:
             self.step(action)
 
@@ -271,8 +277,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.world.build(setup, scene, joints)
         self.robot.reset(joints, scene.held)
         self.robot.hold_still(MAX_SETTLE_STEPS)
-        self._scene, self._start = scene, (setup, scene, joints)
-        self._actions, self._elapsed = [], 0
+        self._start, self._actions = (setup, scene, joints), []
 
     def _move(self, action: Action) -> None:
         self.robot.move(action[:3], float(action[3]), bool(action[4] > 0.5))

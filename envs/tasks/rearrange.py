@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.checks import check_choice
-from envs.colors import CAPTION_COLORS, COLORS
+from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
 from envs.geometry import Sizes
 from envs.physics.robot import Robot
 from envs.physics.simulation import Tabletop
@@ -66,7 +66,8 @@ FAMILIES: dict[str, Family] = {
     "tower": Family(("block", "block", "block", "bowl"), {}, (GoalPair("on", 1, 0), GoalPair("on", 2, 1))),
     "picture": Family(("block", "bowl", "block", "bowl", "block"), {}, ()),
 }
-"""Another block fills the named bowl; stands on the named block; two blocks change bowls; a tower of three; a picture."""
+"""Name -> what it is: another block fills the named bowl, or stands on the named block; two blocks are to change bowls;
+three are to be a tower; a picture shows the goal."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class Rearrange(Task):
         known = {} if surprises is None else surprises
         wanted = dict(enumerate(item.support for item in scene.picture or ()))
         wanted |= {pair.thing: pair.target for pair in scene.goal}
-        sentences = [pair for pair in self._pairs(scene.objects)]
+        sentences = self._pairs(scene.objects)
         # A* search: a sentence moves one block, so as many are needed as blocks are elsewhere.
         lengths, order, highest = {start: 0}, count(), max(HIGHEST, _highest(start))
         frontier: list[tuple[int, int, Supports, tuple[GoalPair, ...]]] = [(0, next(order), start, ())]
@@ -140,6 +141,27 @@ class Rearrange(Task):
             if support != start[moved]:
                 asked.append(Question(self.scene(tuple(objects), (pair,)).instruction, moved, support))
         return tuple(asked)
+
+    def sentences(self, objects: Sequence[ObjectSpec], color_split: ColorSplit) -> list[GoalPair]:
+        """Everything that may be said in one sentence, sensible or not, with the colours of a split."""
+        colors = CAPTION_COLORS[color_split]
+        return [
+            pair
+            for pair in self._pairs(objects)
+            if {objects[pair.thing].color, objects[pair.target].color}.issubset(colors)
+        ]
+
+    def open_pairs(self, objects: Sequence[ObjectSpec], color_split: ColorSplit) -> list[GoalPair]:
+        """The goals of one pair that a layout does not fulfil and can reach."""
+        start = tuple(item.support for item in objects)
+        pairs = self.sentences(objects, color_split)
+        return [pair for pair in pairs if self.solve(self.scene(tuple(objects), (pair,)), start)]
+
+    def draw_goal(
+        self, rng: np.random.Generator, objects: Sequence[ObjectSpec], color_split: ColorSplit, n_pairs: int
+    ) -> tuple[GoalPair, ...]:
+        """One open pair: two may exclude each other."""
+        return super().draw_goal(rng, objects, color_split, 1)
 
     # -- Scenes --------------------------------------------------------------------------------------------
 
