@@ -59,7 +59,7 @@ class Args:
     workers: int = 1
     """Processes."""
     out: Path | None = None
-    """The file to write. Default: data/tabletop-SPLIT.h5, or preview-SPLIT.png."""
+    """The file to write. Default: data/tabletop-SPLIT.h5 (sentences-SPLIT.h5), or preview-SPLIT.png."""
     image_size: int = 64
     """Height and width in pixels."""
     scene: SceneName = "simple"
@@ -101,7 +101,8 @@ def main(args: Args) -> None:
         save_contact_sheet(config, min(args.episodes, 8), out)
         print(f"wrote {out}")
     else:
-        out = args.out or Path(f"data/tabletop-{args.split}.h5")
+        name = "tabletop" if args.policy == "expert" else "sentences"
+        out = args.out or Path(f"data/{name}-{args.split}.h5")
         collect(config, args.episodes, out, args.workers)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
 
