@@ -49,7 +49,7 @@ def play(scene: str, family: str, seeds: range) -> list[Played]:
     task, results = env.task, []
     for seed in seeds:
         _, info = env.reset(seed=seed, options={"family": family})
-        start, said = tuple(info["supports"].tolist()), task.sentences(env.scene.objects, "seen")
+        start, said = info["supports"], task.sentences(env.scene.objects, "seen")
         plan = task.solve(env.scene, start)
         assert plan and not info["is_success"]
         should = [all(task.holds(arrangement_after(start, pair), env.scene)) for pair in said]

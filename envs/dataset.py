@@ -119,7 +119,7 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
     allowed, objects = task.sentences(env.scene.objects, split.color_split), env.scene.objects
     for sentence in range(config.sentences):
         pair = allowed[int(rng.integers(len(allowed)))]
-        first, before = _last_frame(info), tuple(info["supports"].tolist())
+        first, before = _last_frame(info), info["supports"]
         info = env.step(expert.primitive(pair))[4]
         yield RecordedEpisode(
             seed=seed,
@@ -130,7 +130,7 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
             factors=info["factors"],
             arrays=_arrays([first, info]),
             sentence=sentence,
-            supports=(before, tuple(info["supports"].tolist())),
+            supports=(before, info["supports"]),
         )
 
 

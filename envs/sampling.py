@@ -32,9 +32,7 @@ class SceneRequest:
     family: str | None = None  # the kind of scene, where the task has several; drawn when None
     spawn: Box2 = SPAWN  # where objects stand
     edge: float = 0.0  # how far from the edge of that area their centres are, in footprints
-    avoid: tuple[float, float] | None = (
-        None  # where nothing stands, because high stacks would be in the arm's way
-    )
+    avoid: tuple[float, float] | None = None  # where nothing stands: a stack would be in the arm's way
 
     def __post_init__(self) -> None:
         if not len(self.named) <= self.n_objects <= MAX_OBJECTS:

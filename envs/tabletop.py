@@ -67,9 +67,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`, `table`), `camera`
     (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the centre of the top-left
     pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in
-    this scene, see `envs.factors.Factors`), `supports` (n,) (what carries each object: its id, -1 the table, -2
-    nothing, see `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` also has `relations` (of each goal pair
-    its name), `family` (of the scene, or None) and `goal_supports` (n,), of a goal picture, or None. With
+    this scene, see `envs.factors.Factors`), `supports` (of each object what carries it: an id, -1 the table, -2
+    nothing, see `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` has no `target` but `goal` (tuples of a
+    relation and the two ids; none with a goal picture), `goal_supports` (of a goal picture, or None) and `family` (of
+    the scene, or None). With
     ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of `reset`: see
     `envs.physics.recorder.Recorder`.
 
@@ -303,22 +304,25 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "is_success": self.task.succeeded(world, robot, self.scene),
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
-            "target": np.array([(pair.thing, pair.target) for pair in goal]).reshape(-1, 2),
+            "target": np.array([(pair.thing, pair.target) for pair in goal]),
             "objects": [],
             "segmentation": self._recorder.images[-1].segmentation.copy(),
             "palette": world.setup.palette,
             "camera": {"intrinsics": world.camera.intrinsics, "extrinsics": world.camera.extrinsics},
             "gripper": {"position": np.array(robot.tip()), "yaw": robot.yaw, "holding": robot.holding},
-            "supports": np.array(supports(world, robot)),
+            "supports": supports(world, robot),
             "sim_step": world.steps,
             "factors": deepcopy(self._drawn),
         }
-        if self.task.stacks:
+        if (
+            self.task.stacks
+        ):  # no arrays of as many rows as pairs, which vectorised environments could not join
             picture = self.scene.picture
+            del info["target"]
             info |= {
-                "relations": tuple(pair.relation for pair in goal),
+                "goal": tuple(tuple(pair) for pair in goal),
+                "goal_supports": None if picture is None else tuple(item.support for item in picture),
                 "family": self.scene.family,
-                "goal_supports": None if picture is None else np.array([item.support for item in picture]),
             }
         for index, item in enumerate(self.scene.objects):
             position, orientation = map(np.array, world.pose(index))

@@ -40,7 +40,7 @@ def pick_and_place(
     yaw, motion, block = robot.yaw, robot.world.setup.motion, robot.world.sizes.block
     grip_height = block
     if not (robot.holding >= 0 and dist(robot.target[:2], pick) < block / 2):
-        if _top(robot) > robot.target[2]:  # up first, past whatever stands beside
+        if _top(robot) > robot.arm.home[2]:  # up first, past whatever stands beside
             up = (*robot.target[:2], _over_all(robot, motion.pick_height))
             yield from _travel(robot, up, RISE, suction=False)
         yield from _travel(robot, (*pick, _over_all(robot, motion.pick_height)), APPROACH, suction=False)

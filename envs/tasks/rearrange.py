@@ -308,13 +308,15 @@ def _arrange(rng: np.random.Generator, kinds: Sequence[str]) -> dict[int, int]:
 
 
 def _moved(objects: tuple[ObjectSpec, ...], carried_by: Supports) -> tuple[ObjectSpec, ...]:
-    """The objects at the places where what carries them stands."""
+    """The objects, carried as the supports say; what was moved, or is on that, is right over what carries it."""
 
-    def root(index: int) -> int:
-        return index if carried_by[index] < 0 else root(carried_by[index])
+    def base(index: int) -> ObjectSpec:
+        item, support = objects[index], carried_by[index]
+        still = support == item.support and (support < 0 or base(support) is objects[support])
+        return item if still else base(support)
 
-    roots = [objects[root(index)] for index in range(len(objects))]
-    placed = [replace(item, x=base.x, y=base.y) for item, base in zip(objects, roots, strict=True)]
+    bases = [base(index) for index in range(len(objects))]
+    placed = [replace(item, x=below.x, y=below.y) for item, below in zip(objects, bases, strict=True)]
     return with_supports(placed, carried_by)
 
 
