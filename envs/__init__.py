@@ -1,7 +1,7 @@
 """Tabletop environments: a robot arm does what a sentence asks.
 
-Importing this package registers ``PutBlockInBowl-v0`` and ``PutBlocksInBowls-v0`` with Gymnasium; without an
-import, ``gymnasium.make("envs:PutBlockInBowl-v0")`` does the same.
+Importing this package registers ``PutBlockInBowl-v0``, ``PutBlocksInBowls-v0`` and ``RearrangeBlocks-v0`` with
+Gymnasium; without an import, ``gymnasium.make("envs:PutBlockInBowl-v0")`` does the same.
 """
 
 from gymnasium.envs.registration import register
@@ -14,6 +14,7 @@ from envs.tasks import TASKS
 for env_id, task in (
     ("PutBlockInBowl-v0", "put_block_in_bowl"),
     ("PutBlocksInBowls-v0", "put_blocks_in_bowls"),
+    ("RearrangeBlocks-v0", "rearrange_blocks"),
 ):
     register(id=env_id, entry_point="envs.tabletop:TabletopEnv", kwargs={"task": task})
 

@@ -1,4 +1,7 @@
-"""Collect expert episodes into an HDF5 file: ``python -m envs.collect --split train --episodes 10000 --out F``.
+"""Collect episodes into an HDF5 file: ``python -m envs.collect --split train --episodes 10000 --out F``.
+
+The expert does what each scene asks. With ``--policy any-sentence`` random sentences are carried out, sensible or
+not, several in a row in scenes with stacks and filled bowls; each is an episode.
 
 The file is the same for any number of workers. A run that was killed, at whatever moment, is resumed by
 giving the same command again; a finished one is left as it is. docs/data.md describes the file.
@@ -8,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import imageio.v3 as iio
 import numpy as np
@@ -16,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from envs.checks import check_range
-from envs.dataset import EpisodeConfig, collect, episode_count, record_episode
+from envs.dataset import EpisodeConfig, collect, episode_count, record_episodes
 from envs.factors import FACTORS
 from envs.geometry import SIZES
 from envs.physics.camera import PRESETS
@@ -36,22 +39,27 @@ else:
     SizesName = tyro.extras.literal_type_from_choices(SIZES)
     FactorName = tyro.extras.literal_type_from_choices(FACTORS)
 
+SENTENCES = 8  # of a scene
 COLUMNS = 9  # frames of an episode on a contact sheet
 PIXELS, GAP = 128, 4  # height of a row, and the space between its frames
 
 
 @dataclass(frozen=True)
 class Args:
-    """Collect expert episodes into an HDF5 file, or show what they look like."""
+    """Collect episodes into an HDF5 file, or show what they look like."""
 
     split: SplitName = "train"
     """Which scenes; the splits' seeds are disjoint."""
     episodes: int = 100
     """How many episodes the file shall have."""
+    policy: Literal["expert", "any-sentence"] = "expert"
+    """What is played: each scene's own sentence, or any."""
+    sentences_per_scene: int | None = None
+    """Sentences in a row with any-sentence, by default 8."""
     workers: int = 1
     """Processes."""
     out: Path | None = None
-    """The file to write. Default: data/tabletop-SPLIT.h5, or preview-SPLIT.png."""
+    """The file to write. Default: data/tabletop-SPLIT.h5 (sentences-SPLIT.h5), or preview-SPLIT.png."""
     image_size: int = 64
     """Height and width in pixels."""
     scene: SceneName = "simple"
@@ -68,18 +76,33 @@ class Args:
     def __post_init__(self) -> None:
         check_range("--episodes", self.episodes, 1, SEEDS_PER_SPLIT, whole=True)
         check_range("--workers", self.workers, 1, None, whole=True)
+        if self.sentences_per_scene is not None:
+            check_range("--sentences-per-scene", self.sentences_per_scene, 1, None, whole=True)
+            if self.policy == "expert":
+                raise ValueError("--sentences-per-scene needs --policy any-sentence; the expert plays one")
 
 
 def main(args: Args) -> None:
     """Run the command line."""
     factors = SCENES[args.scene].factors.without(args.without)
-    config = EpisodeConfig(args.split, args.scene, args.image_size, args.camera, args.sizes, factors=factors)
+    sentences = 1 if args.policy == "expert" else args.sentences_per_scene or SENTENCES
+    config = EpisodeConfig(
+        args.split,
+        args.scene,
+        args.image_size,
+        args.camera,
+        args.sizes,
+        factors=factors,
+        policy=args.policy,
+        sentences=sentences,
+    )
     if args.preview:
         out = args.out or Path(f"preview-{args.split}.png")
         save_contact_sheet(config, min(args.episodes, 8), out)
         print(f"wrote {out}")
     else:
-        out = args.out or Path(f"data/tabletop-{args.split}.h5")
+        name = "tabletop" if args.policy == "expert" else "sentences"
+        out = args.out or Path(f"data/{name}-{args.split}.h5")
         collect(config, args.episodes, out, args.workers)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
 
@@ -88,7 +111,8 @@ def save_contact_sheet(config: EpisodeConfig, episodes: int, out: Path) -> None:
     """Write a PNG with one row for each episode: frames evenly spread from the first to the last."""
     env = config.make()
     try:
-        rows = [_contact_row(record_episode(env, config, i).arrays["frames"]) for i in range(episodes)]
+        played = record_episodes(env, config, range(episodes))
+        rows = [_contact_row(episode.arrays["frames"]) for episode in played]
     finally:
         env.close()
     out.parent.mkdir(parents=True, exist_ok=True)

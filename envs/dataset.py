@@ -1,4 +1,4 @@
-"""The data set: expert episodes, the HDF5 file that holds them (docs/data.md), and many processes that fill it."""
+"""The data set: episodes, the HDF5 file that holds them (docs/data.md), and many processes that fill it."""
 
 from __future__ import annotations
 
@@ -29,9 +29,11 @@ from envs.scenes import Setup, make_setup
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks import TASKS, Question
+from envs.tasks.rearrange import Rearrange, Supports, with_supports
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
+NO_OBJECT = -3  # the support of an object that is not there
 EPISODES_PER_PIECE = 50  # a kill costs each worker at most the piece it is at: a few seconds
 EPISODES_PER_MERGE = 500
 
@@ -54,11 +56,20 @@ class EpisodeConfig:
     factors: Factors | None = None
     object_scale: float = 1.0
     render_stride: int = 16
+    policy: str = "expert"  # or "any-sentence"
+    sentences: int = 1  # of each scene, with "any-sentence"; each is an episode
+
+    @property
+    def task(self) -> str:
+        """The name of the task that is played."""
+        return SPLITS[self.split].task if self.policy == "expert" else "rearrange_blocks"
 
     def make(self) -> TabletopEnv:
         """The environment that plays such episodes."""
         arguments = {field.name: getattr(self, field.name) for field in fields(self)}
-        return TabletopEnv(SPLITS[arguments.pop("split")].task, record_frames=True, **arguments)
+        for name in ("split", "policy", "sentences"):
+            del arguments[name]
+        return TabletopEnv(self.task, record_frames=True, **arguments)
 
     @property
     def setup(self) -> Setup:
@@ -68,7 +79,7 @@ class EpisodeConfig:
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """An expert's episode of T frames; frame 0 is what `reset` showed."""
+    """An episode of T frames; frame 0 is what `reset`, or the sentence before, left to see."""
 
     seed: int
     instruction: str
@@ -77,32 +88,91 @@ class RecordedEpisode:
     success: bool
     factors: dict[str, Any]  # values of this scene's factors
     arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
+    sentence: int = 0  # its number in its scene
+    supports: tuple[Supports, Supports] = ((), ())  # before and after it, by object, with "any-sentence"
+
+
+def record_episodes(env: TabletopEnv, config: EpisodeConfig, numbers: range) -> Iterator[RecordedEpisode]:
+    """Play episodes of the split in an environment of `EpisodeConfig.make`.
+
+    A function of the configuration and the numbers alone, whatever the environment did before.
+    """
+    if config.policy == "expert":
+        yield from (record_episode(env, config, number) for number in numbers)
+        return
+    many = config.sentences
+    for scene in range(numbers.start // many, -(-numbers.stop // many)):
+        for episode in record_sentences(env, config, scene):
+            if scene * many + episode.sentence in numbers:
+                yield episode
+
+
+def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Iterator[RecordedEpisode]:
+    """Play random sentences, sensible or not, one after the other in one scene of the split."""
+    split, task, expert = SPLITS[config.split], env.task, Expert(env)
+    assert isinstance(task, Rearrange)
+    seed = split.seed(scene)
+    rng = np.random.default_rng([seed, 2])
+    arm = "random" if rng.random() < split.moved_arm else "home"
+    options = {"n_objects": split.n_objects, "color_split": split.color_split, "arm_start": arm}
+    _, info = env.reset(seed=seed, options=options)
+    allowed, objects = task.sentences(env.scene.objects, split.color_split), env.scene.objects
+    for sentence in range(config.sentences):
+        pair = allowed[int(rng.integers(len(allowed)))]
+        first, before = _last_frame(info), info["supports"]
+        info = env.step(expert.primitive(pair))[4]
+        yield RecordedEpisode(
+            seed=seed,
+            instruction=task.scene(objects, (pair,)).instruction,
+            objects=_named(info),
+            questions=task.questions(with_supports(objects, before)),
+            success=task.relation(pair).fulfilled(env.world, env.robot, pair),
+            factors=info["factors"],
+            arrays=_arrays([first, info]),
+            sentence=sentence,
+            supports=(before, info["supports"]),
+        )
 
 
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
-    """Let the expert play episode number ``episode`` of the split in an environment of `EpisodeConfig.make`.
-
-    A function of the configuration and the number alone, whatever the environment did before.
-    """
+    """Let the expert play episode number ``episode`` of the split; see `record_episodes`."""
     split = SPLITS[config.split]
     seed = split.seed(episode)
     _, info = env.reset(seed=seed, options=split.options(seed))
     infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
-    states = [each["frame_states"] for each in infos]
-    kept = ("id", "label", "kind", "color")
     return RecordedEpisode(
         seed=seed,
         instruction=info["instruction"],
-        objects=tuple({key: item[key] for key in kept} for item in info["objects"]),
+        objects=_named(info),
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
         factors=info["factors"],
-        arrays={
-            "frames": np.concatenate([each["frames"] for each in infos]),
-            "segmentation": np.concatenate([each["frame_segmentations"] for each in infos]),
-            **{name: np.concatenate([state[name] for state in states]) for name in states[0]},
-        },
+        arrays=_arrays(infos),
     )
+
+
+def _named(info: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+    """What does not change about the objects."""
+    return tuple({key: item[key] for key in ("id", "label", "kind", "color")} for item in info["objects"])
+
+
+def _arrays(infos: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    """All frames of some steps, and what they show."""
+    states = [each["frame_states"] for each in infos]
+    return {
+        "frames": np.concatenate([each["frames"] for each in infos]),
+        "segmentation": np.concatenate([each["frame_segmentations"] for each in infos]),
+        **{name: np.concatenate([state[name] for state in states]) for name in states[0]},
+    }
+
+
+def _last_frame(info: dict[str, Any]) -> dict[str, Any]:
+    """A step's last frame, as a step of its own."""
+    return {
+        "frames": info["frames"][-1:],
+        "frame_segmentations": info["frame_segmentations"][-1:],
+        "frame_states": {name: values[-1:] for name, values in info["frame_states"].items()},
+    }
 
 
 # -- The file ----------------------------------------------------------------------------------------------
@@ -122,8 +192,9 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
 _TEXT = h5py.string_dtype()
+_Columns = dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]]
 # Name -> type and value of an episode; where it starts is known when it is written.
-_COLUMNS: dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]] = {
+_COLUMNS: _Columns = {
     "length": ("i8", lambda episode: len(episode.arrays["frames"])),
     "seed": ("i8", lambda episode: episode.seed),
     "instruction": (_TEXT, lambda episode: episode.instruction),
@@ -132,6 +203,17 @@ _COLUMNS: dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]] = {
     "factors": (_TEXT, lambda episode: json.dumps(episode.factors)),
     "success": ("?", lambda episode: episode.success),
 }
+_SUPPORTS = np.dtype(("i1", (MAX_OBJECTS,)))
+# Those that files of "any-sentence" have besides.
+_SENTENCE_COLUMNS: _Columns = {
+    "sentence": ("i8", lambda episode: episode.sentence),
+    "supports_before": (_SUPPORTS, lambda episode: _padded_supports(episode.supports[0])),
+    "supports_after": (_SUPPORTS, lambda episode: _padded_supports(episode.supports[1])),
+}
+
+
+def _columns(config: EpisodeConfig) -> _Columns:
+    return _COLUMNS if config.policy == "expert" else _COLUMNS | _SENTENCE_COLUMNS
 
 
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
@@ -144,7 +226,7 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
                 _create(file, config)
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
-                    names = [*_ARRAYS, *(f"episode/{name}" for name in _COLUMNS)]
+                    names = [*_ARRAYS, *(f"episode/{name}" for name in _columns(config))]
                     _append(file, {name: source[name][:] for name in names})
 
 
@@ -194,8 +276,11 @@ def _create(file: h5py.File, config: EpisodeConfig) -> None:
         shape = tuple(config.image_size if n == SIDE else n for n in shape)
         sizes = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (chunk, *shape)}
         file.create_dataset(name, dtype=dtype, **sizes, **compression)
-    for name, (dtype, _) in {"start": ("i8", None), **_COLUMNS}.items():
-        file.create_dataset(f"episode/{name}", (0,), dtype, maxshape=(None,), chunks=(1024,))
+    for name, (dtype, _) in {"start": ("i8", None), **_columns(config)}.items():
+        base, shape = (dtype.base, dtype.shape) if isinstance(dtype, np.dtype) else (dtype, ())
+        file.create_dataset(
+            f"episode/{name}", (0, *shape), base, maxshape=(None, *shape), chunks=(1024, *shape)
+        )
     versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
     ur5 = find_package()
     file.attrs.update(
@@ -205,7 +290,7 @@ def _create(file: h5py.File, config: EpisodeConfig) -> None:
         first_seed=split.first_seed,
         config=_config_json(config),
         versions=json.dumps(versions | {PACKAGE: ur5.version if ur5 else None}),
-        vocabulary=json.dumps(TASKS[split.task].vocabulary),
+        vocabulary=json.dumps(TASKS[config.task].vocabulary),
         labels=json.dumps(LABELS),
         camera_intrinsics=camera.intrinsics,
         camera_extrinsics=camera.extrinsics,
@@ -228,8 +313,15 @@ def _padded(name: str, values: NDArray[Any]) -> NDArray[Any]:
     return np.pad(values, ((0, 0), (0, MAX_OBJECTS - values.shape[1]), (0, 0)), constant_values=np.nan)
 
 
+def _padded_supports(supports: Supports) -> tuple[int, ...]:
+    return (*supports, *(NO_OBJECT,) * (MAX_OBJECTS - len(supports)))
+
+
 def _config_json(config: EpisodeConfig) -> str:
-    return json.dumps(asdict(config) | {"factors": asdict(config.setup.factors)})
+    values = asdict(config) | {"factors": asdict(config.setup.factors)}
+    if config.policy == "expert":  # as in files that are older than other policies
+        del values["policy"], values["sentences"]
+    return json.dumps(values)
 
 
 # -- Many processes, one file ------------------------------------------------------------------------------
@@ -246,8 +338,8 @@ def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -
     """
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
-    starts = range(done, episodes, EPISODES_PER_PIECE)
-    ranges = [(start, min(start + EPISODES_PER_PIECE, episodes)) for start in starts]
+    step = max(1, EPISODES_PER_PIECE // config.sentences) * config.sentences  # whole scenes
+    ranges = [(start, min(start + step, episodes)) for start in range(done, episodes, step)]
     pieces = [parts / f"{start:07d}-{stop:07d}.h5" for start, stop in ranges]
     waiting: list[Path] = []
     with tqdm(total=episodes, initial=min(done, episodes), unit="episode", desc=config.split) as progress:
@@ -277,9 +369,9 @@ def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path) ->
     if episode_count(piece, config) == stop - start:
         return
     env = _environment(config)
-    episodes = [record_episode(env, config, number) for number in range(start, stop)]
+    episodes = list(record_episodes(env, config, range(start, stop)))
     values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
-    for name, (dtype, value) in _COLUMNS.items():
+    for name, (dtype, value) in _columns(config).items():
         values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
     with _atomically(piece, piece.parent) as part, h5py.File(part, "w") as file:
         _create(file, config)

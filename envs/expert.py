@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.motion import pick_and_place
+from envs.physics.supports import supports
 from envs.scene import GoalPair
 from envs.spaces import primitive_space
 from envs.tabletop import TabletopEnv
+from envs.tasks.rearrange import Rearrange, Supports, arrangement_after
 
 
 class Expert:
@@ -38,8 +40,36 @@ class Expert:
             ValueError: at once, when the instruction cannot be read or names a thing that is not there.
         """
         scene, task = self._env.scene, self._env.task
-        goal = scene.goal if instruction is None else task.find_goal(scene.objects, task.parse(instruction))
-        return self._play(goal)
+        if instruction is not None:
+            return self._play(task.find_goal(scene.objects, task.parse(instruction)))
+        return self._play(self.search() if isinstance(task, Rearrange) else scene.goal)
+
+    def search(self, budget: int = 40) -> tuple[GoalPair, ...]:
+        """Sentences that lead to the goal of a `RearrangeBlocks-v0`, tried in a copy of the scene.
+
+        A plan is searched by what its sentences should lead to, and then tried. Where one leads elsewhere, that is
+        kept in mind and a new plan is made, until one succeeds or ``budget`` sentences were tried. Then it is what was
+        tried last; with no plan at all, nothing.
+        """
+        env, task = self._env, self._env.task
+        assert isinstance(task, Rearrange)
+        surprises: dict[tuple[Supports, GoalPair], Supports] = {}
+        start, plan, twin = supports(env.world, env.robot), None, env.copy()
+        while budget > 0 and (plan := task.solve(env.scene, start, surprises)):
+            state, tried = start, 0
+            for sentence in plan:
+                for action in Expert(twin)._play((sentence,)):
+                    twin.step(action)
+                before, state, tried = state, supports(twin.world, twin.robot), tried + 1
+                if state != surprises.get((before, sentence), arrangement_after(before, sentence)):
+                    surprises[before, sentence] = state
+                    break
+            budget, plan = budget - tried, plan[:tried]
+            if task.succeeded(twin.world, twin.robot, env.scene):
+                break
+            twin.follow(env)
+        twin.close()
+        return plan or ()
 
     def primitive(self, pair: GoalPair) -> NDArray[np.float32]:
         """`[pick_x, pick_y, place_x, place_y]` (metres) that carries out one pair of a goal."""

@@ -15,14 +15,15 @@ from envs.factors import read_factors
 from envs.geometry import Point, Sizes
 from envs.physics.arm import Arm, Joints
 from envs.sampling import SceneRequest, arm_jitter
-from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, read_layout
+from envs.scene import Instruction, ObjectSpec, Scene, read_layout
 from envs.scenes import Setup
 from envs.tasks.base import Task
 
+_WITH_LAYOUT = ("color_split", "goal_layout")  # options of random scenes that a layout may have too
+_OF_GOAL = ("family", "goal_layout")
 CARRIED_MARGIN = 0.1  # how far inside the spawn area a carried block starts, so that the arm reaches it
 
-RANDOM_SCENE_OPTIONS = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
-OPTIONS = ("layout", "instruction", "arm_start", "factors", *RANDOM_SCENE_OPTIONS)
+OPTIONS = ("layout", "instruction", "arm_start", "factors")  # of every task, which adds its `scene_options`
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class ResetOptions:
 
     task: Task
     layout: tuple[ObjectSpec, ...] | None
-    goal: tuple[GoalPair, ...] | None  # where layout and instruction are both given
+    scene: Scene | None  # where the layout and its goal are both given
     arm_start: str | Joints
     request: SceneRequest
     setup: Setup
@@ -46,9 +47,12 @@ class ResetOptions:
         setup = self.setup.with_factors(drawn)
         if layout is None:
             scene = task.sample(rng, request, setup.sizes)
-            scene = factors.rearrange(rng, scene, setup.sizes, setup.spawn.shrunk(CARRIED_MARGIN))
+            if not task.stacks:  # such tasks fill bowls and stack blocks themselves
+                scene = factors.rearrange(rng, scene, setup.sizes, setup.spawn.shrunk(CARRIED_MARGIN))
+        elif self.scene is not None:
+            scene = self.scene
         else:
-            goal = self.goal or task.draw_goal(rng, layout, request.color_split, len(request.named) // 2)
+            goal = task.draw_goal(rng, layout, request.color_split, len(request.named) // 2)
             scene = task.scene(layout, goal)
         joints = setup.arm.home_joints if isinstance(self.arm_start, str) else self.arm_start
         if self.arm_start == "random":
@@ -74,52 +78,69 @@ def read_options(
     options = {} if options is None else options
     if not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping, not {type(options).__name__}")
-    if unknown := ", ".join(map(repr, sorted(set(options) - set(OPTIONS)))):
-        raise ValueError(f"unknown reset option {unknown}; allowed: {', '.join(OPTIONS)}")
+    allowed = (*OPTIONS, *task.scene_options)
+    if unknown := ", ".join(map(repr, sorted(set(options) - set(allowed)))):
+        raise ValueError(f"unknown reset option {unknown}; allowed: {', '.join(allowed)}")
     factors = read_factors(options["factors"]) if options.get("factors") is not None else None
-    layout = None
+    sizes = setup.with_factors(factors or {}).sizes
+    layout = picture = None
     if options.get("layout") is not None:
-        sizes = setup.with_factors(factors or {}).sizes
-        layout = read_layout(options["layout"], sizes, setup.workspace, setup.crowded)
+        layout = _read_layout(options["layout"], task, setup, sizes)
         for item in layout:
             tip = _holding_tip(item, sizes)
             if item.height is not None and setup.arm.within_reach(tip) != tip:
                 raise ValueError(f"the arm cannot hold the {item.thing} at {tip[:2]}, {item.height} m high")
     steps = task.parse(options["instruction"]) if options.get("instruction") is not None else None
+    if options.get("goal_layout") is not None:
+        if layout is None or steps is not None:
+            raise ValueError("a goal_layout needs a layout, and stands instead of an instruction")
+        picture = _read_layout(options["goal_layout"], task, setup, sizes)
     if layout is not None:
-        clash = [name for name in RANDOM_SCENE_OPTIONS if name in options and name != "color_split"]
+        clash = [name for name in task.scene_options if name in options and name not in _WITH_LAYOUT]
         if clash:
             raise ValueError(f"{', '.join(clash)} describe a random scene and cannot be given with a layout")
         there = {item.kind for item in layout}
         missing = [kind for relation in task.relations for kind in relation.kinds if kind not in there]
         if missing:
             raise ValueError(f"a layout has at least one {missing[0]}")
-    request = _read_request(options, defaults, steps if layout is None else None)
-    goal = None
-    if layout is not None and steps is not None:
-        goal = task.find_goal(layout, steps)
-        if all(task.relation(pair).fulfilled_at_start(layout, pair.thing, pair.target) for pair in goal):
-            raise ValueError("the layout already fulfils the instruction; ask for something else")
+    request = _read_request(options, task, defaults, steps if layout is None else None)
+    scene = None
+    if layout is not None and picture is not None:
+        scene = task.picture_scene(layout, picture)
+    elif layout is not None and steps is not None:
+        scene = task.scene(layout, task.find_goal(layout, steps))
     elif layout is not None and not task.open_pairs(layout, request.color_split):
         raise ValueError(
             f"no instruction with colours {', '.join(CAPTION_COLORS[request.color_split])} "
             f"has anything to do in this layout; give an 'instruction', or another 'color_split'"
         )
     task.check_instructions(steps or ())
+    if scene is not None:
+        task.check_scene(scene)
     arm_start = _read_arm_start(options.get("arm_start", "home"), setup.arm)
-    return ResetOptions(task, layout, goal, arm_start, request, setup, factors)
+    return ResetOptions(task, layout, scene, arm_start, request, setup, factors)
+
+
+def _read_layout(items: Any, task: Task, setup: Setup, sizes: Sizes) -> tuple[ObjectSpec, ...]:
+    return read_layout(items, sizes, setup.workspace, setup.crowded and not task.stacks, task.stacks)
 
 
 def _read_request(
-    options: Mapping[str, Any], defaults: SceneRequest, steps: tuple[Instruction, ...] | None
+    options: Mapping[str, Any], task: Task, defaults: SceneRequest, steps: tuple[Instruction, ...] | None
 ) -> SceneRequest:
     """What a random scene must be like, with what ``steps`` name."""
-    given = {name: options[name] for name in RANDOM_SCENE_OPTIONS if name in options}
+    given = {name: options[name] for name in task.scene_options if name in options and name not in _OF_GOAL}
     check_choice("color_split", given.get("color_split", "all"), CAPTION_COLORS, form=str)
     for name in ("n_objects", "n_bowls", "blocks_in_bowls"):
         check_range(name, given.get(name, 0), 0, None, whole=True)
     if not isinstance(given.get("target_in_bowl", False), bool | np.bool_):
         raise ValueError(f"target_in_bowl must be True or False, not {given['target_in_bowl']!r}")
+    if options.get("family") is not None:
+        defaults = task.with_family(defaults, options["family"])
+    elif task.stacks and "n_bowls" in given:
+        raise ValueError("n_bowls needs a family, which says how many are possible")
+    if task.stacks and steps is not None:
+        raise ValueError("an instruction needs a layout here: a random scene's family says what its goal is")
     if steps is not None:
         named = [thing for step in steps for thing in step.things]
         if len({thing.color for thing in named}) < len(named):

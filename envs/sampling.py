@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import hypot, pi
+from math import dist, hypot, pi
 
 import numpy as np
 
 from envs.colors import COLORS, ColorSplit
 from envs.geometry import SPAWN, Box2, Sizes
-from envs.scene import MAX_OBJECTS, Instruction, ObjectSpec, Thing
+from envs.scene import MAX_OBJECTS, TABLE, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
 MAX_TRIES = 5000  # whole layouts, 0.3 ms each; the fullest scene needs about 100 (at most 516 in 60 seeds)
+AVOIDED = 0.08  # metres around the arm's resting place in which no stack may grow
 ARM_JITTER = 0.08  # half-width in radians of the random joint offsets of a perturbed start pose
 
 
@@ -28,8 +29,10 @@ class SceneRequest:
     instructions: tuple[Instruction, ...] | None = None  # what the instruction asks for; drawn when None
     blocks_in_bowls: int = 0  # how many blocks that are not named start in bowls that are not named
     target_in_bowl: bool = False  # whether the first named block starts in a bowl that is not named
+    family: str | None = None  # the kind of scene, where the task has several; drawn when None
     spawn: Box2 = SPAWN  # where objects stand
     edge: float = 0.0  # how far from the edge of that area their centres are, in footprints
+    avoid: tuple[float, float] | None = None  # where nothing stands: a stack would be in the arm's way
 
     def __post_init__(self) -> None:
         if not len(self.named) <= self.n_objects <= MAX_OBJECTS:
@@ -65,12 +68,27 @@ def sample_objects(
     things = [*named, *map(Thing, others[: len(kinds)], kinds)]
     # Ids carry no meaning: without the shuffle the target would always be object 0.
     things = [things[k] for k in rng.permutation(len(things))]
-    insides = _draw_insides(rng, request, things, named)
-    places = _draw_places(rng, request, [thing.kind for thing in things], insides, sizes)
-    return tuple(
-        ObjectSpec(thing.kind, thing.color, x, y, float(rng.uniform(-pi, pi)), insides.get(index))
-        for index, (thing, (x, y)) in enumerate(zip(things, places, strict=True))
-    )
+    return place_objects(rng, request, things, _draw_insides(rng, request, things, named), sizes)
+
+
+def place_objects(
+    rng: np.random.Generator,
+    request: SceneRequest,
+    things: Sequence[Thing],
+    carriers: dict[int, int],
+    sizes: Sizes,
+) -> tuple[ObjectSpec, ...]:
+    """Draw places and yaws of things, by id.
+
+    ``carriers`` says of each block that is not on the table the id of the bowl or block that it is put on; lower ones
+    come first.
+    """
+    places = _draw_places(rng, request, [thing.kind for thing in things], carriers, sizes)
+    objects = [
+        ObjectSpec(thing.kind, thing.color, x, y, float(rng.uniform(-pi, pi)))
+        for thing, (x, y) in zip(things, places, strict=True)
+    ]
+    return tuple(item.carried_by(carriers.get(index, TABLE), objects) for index, item in enumerate(objects))
 
 
 def arm_jitter(rng: np.random.Generator) -> tuple[float, ...]:
@@ -93,10 +111,10 @@ def _draw_insides(
 
 
 def _draw_places(
-    rng: np.random.Generator, request: SceneRequest, kinds: list[str], insides: dict[int, int], sizes: Sizes
+    rng: np.random.Generator, request: SceneRequest, kinds: list[str], carriers: dict[int, int], sizes: Sizes
 ) -> list[tuple[float, float]]:
-    """Places such that no object touches or much hides another."""
-    standing = [index for index in range(len(kinds)) if index not in insides]
+    """Places such that no object touches or much hides another but what carries it."""
+    standing = [index for index in range(len(kinds)) if index not in carriers]
     # Wide things first: a late bowl would find only gaps that fit a block.
     standing.sort(key=lambda index: -sizes.footprint(kinds[index]))
     for _ in range(MAX_TRIES):
@@ -107,11 +125,11 @@ def _draw_places(
         raise ValueError(
             f"{count} objects of this size do not fit on the table; use fewer, or a smaller scale"
         )
-    for block, bowl in insides.items():
-        # Within the millimetres that leave the block flat on the bowl's floor at any yaw.
+    for block, lower in carriers.items():
+        # Within the millimetres that leave the block flat on a bowl's floor at any yaw.
         slack = max(0.0, sizes.bowl_floor_radius - sizes.footprint("block"))
         radius, angle = slack * float(rng.random()) ** 0.5, float(rng.uniform(0, 2 * pi))
-        places[block] = (places[bowl][0] + radius * np.cos(angle), places[bowl][1] + radius * np.sin(angle))
+        places[block] = (places[lower][0] + radius * np.cos(angle), places[lower][1] + radius * np.sin(angle))
     return [places[index] for index in range(len(kinds))]
 
 
@@ -122,6 +140,8 @@ def _try_places(
     for index in standing:
         area = request.spawn.shrunk(request.edge * sizes.footprint(kinds[index]))
         for x, y in rng.uniform((area.x[0], area.y[0]), (area.x[1], area.y[1]), size=(40, 2)).tolist():
+            if request.avoid is not None and dist(request.avoid, (x, y)) < AVOIDED:
+                continue
             if all(_apart(x - a, y - b, kinds[index], kinds[k], sizes) for k, (a, b) in places.items()):
                 places[index] = (x, y)
                 break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any, NamedTuple
@@ -16,6 +16,9 @@ from envs.geometry import Box2, Sizes
 
 KINDS = ("block", "bowl")
 MAX_OBJECTS = 8  # as many objects as fit side by side into the workspace, each visible
+
+TABLE, NOWHERE = -1, -2
+"""Supports beside ids of objects: the table, and nothing that a sentence could name (held, askew, falling)."""
 
 HELD_HEIGHT = 2.5
 """A block whose centre is higher than this many blocks hangs at the arm: no two blocks reach so high."""
@@ -76,6 +79,18 @@ class ObjectSpec:
         """Whether it stands on the table itself."""
         return self.inside is None and self.on is None and self.height is None
 
+    @property
+    def support(self) -> int:
+        """The id of the bowl or block that carries it, or `TABLE`."""
+        return next((index for index in (self.inside, self.on) if index is not None), TABLE)
+
+    def carried_by(self, support: int, objects: Sequence[ObjectSpec]) -> ObjectSpec:
+        """The same object on another `support`, which counts as the table where it is no id of ``objects``."""
+        kind = objects[support].kind if support >= 0 else "table"
+        return replace(
+            self, inside=support if kind == "bowl" else None, on=support if kind == "block" else None
+        )
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -84,6 +99,8 @@ class Scene:
     objects: tuple[ObjectSpec, ...]
     goal: tuple[GoalPair, ...]
     instruction: str  # the sentence that asks for the goal
+    picture: tuple[ObjectSpec, ...] | None = None  # how all shall lie in the end, where a picture is the goal
+    family: str | None = None  # the kind of random scene
 
     @property
     def held(self) -> int:
@@ -91,14 +108,16 @@ class Scene:
         return next((index for index, item in enumerate(self.objects) if item.height is not None), -1)
 
 
-def read_layout(items: Any, sizes: Sizes, workspace: Box2, crowded: bool = False) -> tuple[ObjectSpec, ...]:
+def read_layout(
+    items: Any, sizes: Sizes, workspace: Box2, crowded: bool = False, stacked: bool = False
+) -> tuple[ObjectSpec, ...]:
     """Check an explicit layout: a sequence of mappings with `kind`, `color`, `xy` (metres), optionally `yaw`.
 
     ``info["objects"]`` of an earlier `reset` is a layout too: `position` and `orientation` (a quaternion)
     stand for `xy` and `yaw`. A block whose centre is within a bowl's floor lies in that bowl.
 
-    With ``crowded``, objects may share a colour, and the third value of a `position` counts: a block that is
-    higher than another at the same place stands on it, and one much higher hangs at the arm.
+    With ``stacked`` the third value of a `position` counts: a block that is higher than another at the same place
+    stands on it. With ``crowded`` too, but one that is much higher hangs at the arm, and objects may share a colour.
 
     Raises:
         ValueError: for anything that is not such a layout, two objects of one colour, overlapping objects, or
@@ -113,8 +132,8 @@ def read_layout(items: Any, sizes: Sizes, workspace: Box2, crowded: bool = False
         counts = Counter(item.color for item in objects)
         if twice := ", ".join(sorted(color for color in counts if counts[color] > 1)):
             raise ValueError(f"no two objects may share a colour, but {twice} is there more than once")
-        objects = [replace(item, height=None) for item in objects]
-    return tuple(_find_supports(objects, sizes))
+        objects = [replace(item, height=item.height if stacked else None) for item in objects]
+    return tuple(_find_supports(objects, sizes, may_hang=crowded))
 
 
 _EXAMPLE = "{'kind': 'block', 'color': 'red', 'xy': (0.5, 0.1)}"
@@ -142,20 +161,22 @@ def _read_object(item: Any, workspace: Box2) -> ObjectSpec:
     return ObjectSpec(str(kind), str(color), x, y, yaw, height=height)
 
 
-def _find_supports(objects: list[ObjectSpec], sizes: Sizes) -> list[ObjectSpec]:
+def _find_supports(objects: list[ObjectSpec], sizes: Sizes, may_hang: bool) -> list[ObjectSpec]:
     """Mark the blocks that lie in bowls, stand on blocks or hang at the arm, and refuse other overlaps."""
     placed: list[ObjectSpec] = []
     radius = inside_radius(sizes)
     for item in objects:
         inside = on = None
-        held = item.height is not None and item.height > HELD_HEIGHT * sizes.block
+        held = may_hang and item.height is not None and item.height > HELD_HEIGHT * sizes.block
         for index, other in enumerate(objects if item.kind == "block" and not held else ()):
             distance = hypot(item.x - other.x, item.y - other.y)
             if other.kind == "bowl" and distance <= radius:
                 inside = index
             higher = other.kind == "block" and (item.height or 0) > (other.height or 0) + sizes.block / 2
-            if higher and distance <= max(radius, sizes.block / 2):
+            under = on is None or (other.height or 0) > (objects[on].height or 0)
+            if higher and under and distance <= max(radius, sizes.block / 2):
                 on = index
+        inside = inside if on is None else None
         placed.append(replace(item, inside=inside, on=on, height=item.height if held else None))
     if sum(item.height is not None for item in placed) > 1:
         raise ValueError(

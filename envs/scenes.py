@@ -127,7 +127,7 @@ SIMPLE = Setup(
     edge=0.0,
     # At home the arm is seen at the upper edge of the `close` view, in front of no object.
     arm=Arm(home=(0.348, 0.0, 0.13), reach_low=(0.20, -0.30, 0.006), reach_high=(0.78, 0.30, 0.25)),
-    # At this height a hanging block clears whatever stands on the table.
+    # At this height a hanging block clears all that stands on the table alone; over stacks the arm goes higher.
     motion=Motion(pick_height=0.16, place_height=0.16, descent_speed=0.675),
     # Mild light from above the camera's shoulder, and no shadow: faces and the rim of a bowl stay readable,
     # yet a thing keeps about one colour, the one it is named after. Ambient and diffuse light add up to

@@ -61,6 +61,7 @@ def observation_space(size: int, far: float, longest: int, extras: tuple[str, ..
     possible: dict[str, spaces.Space[Any]] = {
         "depth": spaces.Box(0, np.float32(far) * 1.001, (size, size), np.float32),
         "segmentation": spaces.Box(0, 255, (size, size), np.uint8),
+        "goal_rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
         "proprio": spaces.Box(-10, 10, (11,), np.float32),
     }
-    return spaces.Dict(parts | {name: possible[name] for name in EXTRAS if name in extras})
+    return spaces.Dict(parts | {name: space for name, space in possible.items() if name in extras})

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
-from math import dist
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -15,20 +14,21 @@ from numpy.typing import NDArray
 from envs.checks import check_choice, check_range
 from envs.factors import Factors
 from envs.options import read_options
+from envs.physics.arm import Joints
 from envs.physics.motion import Action, pick_and_place
 from envs.physics.recorder import Recorder
 from envs.physics.robot import Robot
 from envs.physics.simulation import FIRST_OBJECT, Tabletop
+from envs.physics.supports import supports
 from envs.scene import Scene
-from envs.scenes import make_setup
+from envs.scenes import Setup, make_setup
 from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
 from envs.tasks import TASKS, Task
 
 Observation = dict[str, Any]
-EE_SECONDS = 5.0  # time for one goal pair in "ee" mode; a pick-and-place takes 1.6 s
+Control = Literal["primitive", "ee"]
+EE_SECONDS = 5 / 3  # time for each attempt in "ee" mode; a pick-and-place takes 1.6 s
 MAX_SETTLE_STEPS = 120
-HOME_TOLERANCE = 0.02
-"""How close to its resting place, in metres, the arm must be for a solved episode to end."""
 
 
 class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
@@ -37,12 +37,15 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     ## Description
     The task says which sentences there are and when they are fulfilled: "put_block_in_bowl"
     (`PutBlockInBowl-v0`: put the named block into the named bowl), "put_blocks_in_bowls"
-    (`PutBlocksInBowls-v0`: 2 or 3 blocks, each into its bowl). A goal is a list of (thing, target) pairs.
+    (`PutBlocksInBowls-v0`: 2 or 3 blocks, each into its bowl), "rearrange_blocks" (`RearrangeBlocks-v0`: blocks
+    into bowls and onto blocks, in scenes where what a sentence leads to is not always what it says). A goal is a
+    list of (thing, target) pairs or, in `RearrangeBlocks-v0`, a picture.
 
     ## Observation
     A dict: `rgb` (H, W, 3) uint8 and `instruction` (text). With ``extras``: `depth` (H, W) float32 in metres,
     `segmentation` (H, W) uint8 (0 table, 1 arm, 2 + i object i), `proprio` (11,) float32 (6 joint angles in
-    radians; tip x, y, z in metres; yaw in radians; 1 if something is held).
+    radians; tip x, y, z in metres; yaw in radians; 1 if something is held). `RearrangeBlocks-v0` also has
+    `goal_rgb` (H, W, 3) uint8, the goal picture; black where the instruction says the goal.
 
     ## Action
     ``control="primitive"``: `[pick_x, pick_y, place_x, place_y]` in metres of the world frame (with
@@ -52,9 +55,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     stops at contact.
 
     ## Reward and end
-    The reward is the change in the share of goal pairs that are fulfilled. The episode terminates when all
-    are and the arm is back home (so both modes end alike, and a next instruction may start); it truncates
-    after ``max_steps``.
+    The reward is the change in the share of goal pairs that are fulfilled, with a goal picture of blocks that are
+    supported as it shows. The episode terminates when all are and the arm is back home (so both modes end alike,
+    and a next instruction may start); it truncates after ``max_steps``. In `RearrangeBlocks-v0` success itself
+    asks that the empty gripper is home and all objects rest.
 
     ## Info
     Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`,
@@ -63,8 +67,12 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`, `table`), `camera`
     (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the centre of the top-left
     pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in
-    this scene, see `envs.factors.Factors`), `sim_step`. With ``record_frames=True`` also `frames`,
-    `frame_segmentations` and `frame_states` of this step or of `reset`: see `envs.physics.recorder.Recorder`.
+    this scene, see `envs.factors.Factors`), `supports` (of each object what carries it: an id, -1 the table, -2
+    nothing, see `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` has no `target` but `goal` (tuples of a
+    relation and the two ids; none with a goal picture), `goal_supports` (of a goal picture, or None) and `family` (of
+    the scene, or None). With
+    ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of `reset`: see
+    `envs.physics.recorder.Recorder`.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -75,13 +83,17 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     `color_split` ("seen", "unseen", "all"), `blocks_in_bowls` (how many other blocks start in bowls) and
     `target_in_bowl`; `arm_start`: "home", "random" or 6 joint angles; `factors`: values of an earlier
     ``info["factors"]`` instead of random ones. Layout and factors together show the same scene again.
+    `RearrangeBlocks-v0` takes `family` ("plain", "occupied", "covered", "swap", "tower", "picture"; by default the
+    seed draws one), which says what a random scene and its goal are like, with `n_objects`, `n_bowls` and
+    `color_split`; or a `layout` with an `instruction` or a `goal_layout` (the arrangement that the goal picture
+    shows). Blocks of its layouts may stand on each other where their `position` says so.
 
     Args:
         scene: "simple" (made easy), "cliport" (CLIPort's table, robot, grays, light and speed, in the paper's
             view) or "varied" (the same with random factors).
         task: a name of `envs.tasks.TASKS`, or a task of your own.
         n_pairs: how many pairs a random goal has; by default the task's fewest. A given instruction may name
-            1 to the task's most.
+            1 to the task's most. In `RearrangeBlocks-v0` the family says it.
         control: "primitive" or "ee".
         image_size: height and width of the square image, in pixels.
         camera: "close" (a narrow workspace fills the frame) or "paper"; by default the scene's own.
@@ -90,7 +102,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         object_scale: scales blocks and bowls, 0.5 to 1; at 1 they are the paper's, and 8 of them just fit.
         render_stride: physics steps between two camera frames.
         physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
-        max_steps: steps until truncation; by default 3 primitives or 75 frames for each goal pair.
+        max_steps: steps until truncation; by default 3 primitives (`RearrangeBlocks-v0`: 8) for each goal pair, or
+            as many frames as they may take.
         extras: further observations, of "depth", "segmentation", "proprio".
         place_yaw: whether a primitive has a fifth value.
         record_frames: whether `info` holds all frames of a step.
@@ -104,7 +117,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self,
         task: str | Task = "put_block_in_bowl",
         n_pairs: int | None = None,
-        control: Literal["primitive", "ee"] = "primitive",
+        control: Control = "primitive",
         image_size: int = 64,
         camera: str | None = None,
         object_scale: float = 1.0,
@@ -135,10 +148,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
         if max_steps is not None:
             check_range("max_steps", max_steps, 1, 10**9, whole=True)
-        self.control, self.render_mode = control, render_mode
+        self.control, self.render_mode, self.scene_name = control, render_mode, scene
         self.extras, self.place_yaw, self.record_frames = tuple(extras), place_yaw, record_frames
-        per_pair = 3 if control == "primitive" else round(EE_SECONDS * physics_hz / render_stride)
-        self.max_steps = max_steps or per_pair * self.n_pairs
+        frames = 1 if control == "primitive" else EE_SECONDS * physics_hz / render_stride
+        self.max_steps = max_steps or round(self.task.attempts * frames) * self.n_pairs
         self.metadata = self.metadata | {"render_fps": max(1, round(physics_hz / render_stride))}
         if control == "primitive":
             self._box = primitive_space(setup.workspace, place_yaw)
@@ -146,20 +159,23 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._box = ee_space(render_stride / physics_hz)
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
         longest = self.task.longest_sentence
-        self.observation_space = observation_space(image_size, setup.camera.far, longest, self.extras)
+        self.observation_space = observation_space(
+            image_size, setup.camera.far, longest, (*self.extras, *("goal_rgb",) * self.task.stacks)
+        )
         self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
         self.robot = Robot(self.world, render_stride)
         self._recorder = Recorder(self.robot)
-        self._scene: Scene | None = None
+        self._start: tuple[Setup, Scene, Joints] | None = None  # what was built
+        self._actions: list[NDArray[np.float32]] = []  # since the reset
+        self._goal_rgb = np.zeros((image_size, image_size, 3), np.uint8)
         self._drawn: dict[str, Any] = {}
-        self._elapsed = 0
 
     @property
     def scene(self) -> Scene:
         """The scene as it was built, for experts; gymnasium.error.ResetNeeded before the first reset."""
-        if self._scene is None:
+        if self._start is None:
             raise gym.error.ResetNeeded("call reset() first")
-        return self._scene
+        return self._start[1]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -169,14 +185,21 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: for options that are not allowed, before anything changes.
         """
-        request = replace(self.task.request(self.n_pairs), spawn=self.setup.spawn, edge=self.setup.edge)
+        x, y, _ = self.setup.arm.home
+        request = replace(
+            self.task.request(self.n_pairs),
+            spawn=self.setup.spawn,
+            edge=self.setup.edge,
+            avoid=(x, y) if self.task.stacks else None,
+        )
         checked = read_options(options, self.task, request, self.setup)
         super().reset(seed=seed)
         setup, self._drawn, scene, joints = checked.draw(self.np_random)
-        self.world.build(setup, scene, joints)
-        self.robot.reset(joints, scene.held)
-        self.robot.hold_still(MAX_SETTLE_STEPS)
-        self._scene, self._elapsed = scene, 0
+        self._goal_rgb = np.zeros_like(self._goal_rgb)
+        if scene.picture is not None:
+            self._build(setup, replace(scene, objects=scene.picture), setup.arm.home_joints)
+            self._goal_rgb = self.world.render().rgb
+        self._build(setup, scene, joints)
         self._recorder.restart()
         self._recorder.capture()
         return self._observe(), self._info()
@@ -193,6 +216,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         before = self._fulfilled()
         values = check_action(self._box, action)
         self._recorder.restart()
+        self._actions.append(values)
         if self.control == "primitive":
             x, y, place_x, place_y, *turn = values.tolist()
             for motion in pick_and_place(self.robot, (x, y), (place_x, place_y), *turn):
@@ -204,11 +228,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._move(values)
         if not self._recorder.images:
             self._recorder.capture()
-        self._elapsed += 1
         after = self._fulfilled()
         reward = (sum(after) - sum(before)) / len(after)
-        terminated = all(after) and self._is_home()
-        return self._observe(), reward, terminated, self._elapsed >= self.max_steps, self._info()
+        terminated = self.task.succeeded(self.world, self.robot, self.scene) and self.robot.is_home
+        return self._observe(), reward, terminated, len(self._actions) >= self.max_steps, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
         """The newest camera frame (H, W, 3) with "rgb_array"; the window shows itself with "human"."""
@@ -217,18 +240,51 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             return None
         return self._recorder.images[-1].rgb.copy() if self.render_mode == "rgb_array" else None
 
+    def copy(self) -> TabletopEnv:
+        """The same scene in the same state in a simulator of its own, to try things; its pictures are tiny."""
+        twin = TabletopEnv(
+            self.task,
+            control=self.control,
+            image_size=16,
+            render_stride=self.robot.frame_steps,
+            physics_hz=self.world.physics_hz,
+            place_yaw=self.place_yaw,
+            scene=self.scene_name,
+        )
+        twin.follow(self)
+        return twin
+
+    def follow(self, original: TabletopEnv) -> None:
+        """Come to the state of the environment that this one is a copy of, to the last bit.
+
+        Its scene is built and its actions are repeated, because PyBullet's own saved states are not exact.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the original's first reset.
+        """
+        scene, actions = original.scene, original._actions
+        assert original._start is not None
+        setup, _, joints = original._start
+        self._build(setup, scene, joints)
+        for action in actions:
+            self.step(action)
+
     def close(self) -> None:
         """Give PyBullet's memory back. Safe to call twice."""
         self.world.close()
+
+    def _build(self, setup: Setup, scene: Scene, joints: Joints) -> None:
+        """Start anew with ``scene``, settled, and the arm at ``joints``."""
+        self.world.build(setup, scene, joints)
+        self.robot.reset(joints, scene.held)
+        self.robot.hold_still(MAX_SETTLE_STEPS)
+        self._start, self._actions = (setup, scene, joints), []
 
     def _move(self, action: Action) -> None:
         self.robot.move(action[:3], float(action[3]), bool(action[4] > 0.5))
 
     def _fulfilled(self) -> list[bool]:
-        return [self.task.relation(pair).fulfilled(self.world, self.robot, pair) for pair in self.scene.goal]
-
-    def _is_home(self) -> bool:
-        return dist(self.robot.tip(), self.robot.arm.home) < HOME_TOLERANCE
+        return self.task.fulfilled(self.world, self.robot, self.scene)
 
     def _observe(self) -> Observation:
         image, state = self._recorder.images[-1], self._recorder.states[-1]
@@ -238,12 +294,14 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "proprio": np.concatenate([state["arm"], state["gripper"]]),
         }
         always = {"rgb": image.rgb.copy(), "instruction": self.scene.instruction}
+        if self.task.stacks:
+            always["goal_rgb"] = self._goal_rgb.copy()
         return always | {name: extras[name] for name in EXTRAS if name in self.extras}
 
     def _info(self) -> dict[str, Any]:
         world, robot, goal = self.world, self.robot, self.scene.goal
         info: dict[str, Any] = {
-            "is_success": all(self._fulfilled()),
+            "is_success": self.task.succeeded(world, robot, self.scene),
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
             "target": np.array([(pair.thing, pair.target) for pair in goal]),
@@ -252,9 +310,20 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "palette": world.setup.palette,
             "camera": {"intrinsics": world.camera.intrinsics, "extrinsics": world.camera.extrinsics},
             "gripper": {"position": np.array(robot.tip()), "yaw": robot.yaw, "holding": robot.holding},
+            "supports": supports(world, robot),
             "sim_step": world.steps,
             "factors": deepcopy(self._drawn),
         }
+        if (
+            self.task.stacks
+        ):  # no arrays of as many rows as pairs, which vectorised environments could not join
+            picture = self.scene.picture
+            del info["target"]
+            info |= {
+                "goal": tuple(tuple(pair) for pair in goal),
+                "goal_supports": None if picture is None else tuple(item.support for item in picture),
+                "family": self.scene.family,
+            }
         for index, item in enumerate(self.scene.objects):
             position, orientation = map(np.array, world.pose(index))
             named = {"id": index, "label": FIRST_OBJECT + index, "kind": item.kind, "color": item.color}

@@ -28,7 +28,7 @@ class Instruction:
     """One pick-and-place: a thing is moved so that it stands to its target in a relation.
 
     Raises:
-        ValueError: if there is no such relation, or it does not join these kinds of things.
+        ValueError: if there is no such relation, it does not join these kinds of things, or both are one thing.
     """
 
     relation: str  # a key of `RELATIONS`
@@ -43,6 +43,8 @@ class Instruction:
             raise ValueError(
                 f"{self.relation!r} joins {' and '.join(kinds)}, not {self.thing} and {self.target}"
             )
+        if self.thing == self.target:
+            raise ValueError(f"the {self.thing} cannot be {self.relation} itself")
 
     @property
     def text(self) -> str:

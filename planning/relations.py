@@ -9,9 +9,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
-from planning.masks import Bools, center_inside, centroid_distance
+from planning.masks import UNSEEN, Bools, center_inside, centroid_distance, centroids
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,18 @@ class Thresholds:
 # - settle_frames: the block had come to lie there 8 or 9 frames before the end.
 THRESHOLDS = Thresholds(contact_px=2.0, contact_frames=12, settle_frames=3)
 
+STACK_PX = 6.9  # rows by which a block's pixels are higher in the picture than those of the block under it
+
+
+def off_stack(thing_NHW: Tensor, target_NHW: Tensor) -> Tensor:
+    """How far a block's centroid is from where it is on a target: (...) in pixels; inf where a mask is empty.
+
+    Both are bool masks (..., H, W).
+    """
+    offset_N2 = centroids(thing_NHW) - centroids(target_NHW)
+    return (offset_N2 + offset_N2.new_tensor([0.0, STACK_PX])).norm(dim=-1).nan_to_num(nan=UNSEEN)
+
+
 RELATIONS: dict[str, Relation] = {
     "in": Relation(
         template="the {thing} in the {target}",
@@ -65,5 +78,15 @@ RELATIONS: dict[str, Relation] = {
         # The convex outline of the bowl, because a block hides part of the bowl that it lies in.
         holds=center_inside,
         place_height=0.036,
+    ),
+    "on": Relation(
+        template="the {thing} on the {target}",
+        kinds=("block", "block"),
+        distance=off_stack,
+        # On the simulator's masks after 800 random sentences in val scenes, with towers of up to five: 745 of the 747
+        # blocks that stand on another are this near, and 32 of the 5,237 other pairs, 27 of them two apart in a tower.
+        within_px=4.0,
+        holds=lambda thing, target: bool(off_stack(torch.as_tensor(thing), torch.as_tensor(target)) <= 4.0),
+        place_height=0.087,
     ),
 }

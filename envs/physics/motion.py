@@ -22,6 +22,7 @@ CLEARANCE = 0.018  # metres that the tip lets go higher than at the pick: over t
 MAX_SPEED = 3.0  # fastest motion of the tip along an axis, in m/s
 MAX_TURN = 8.0  # fastest turn of the tip, in rad/s
 
+STACK_GAP = 0.02  # metres between a hanging block that is carried and the highest block that it may pass
 CLEAR = 0.06  # metres that the tip first rises straight up, out of a bowl, with joints at constant speed
 # Seconds. Nearly constant, whatever the distance: an episode of the default camera has about 25 frames.
 APPROACH, LIFT, CARRY, LOWER, RELEASE, RISE, RETURN = 4 / 15, 3 / 15, 5 / 15, 2 / 15, 1 / 15, 2 / 15, 4 / 15
@@ -36,21 +37,42 @@ def pick_and_place(
     when nothing was gripped: a wrong pick is a real failure, not an error. What already hangs over the place
     to pick is only carried on.
     """
-    yaw, motion, grip_height = robot.yaw, robot.world.setup.motion, robot.world.sizes.block
-    over_pick, over_place = (*pick, motion.pick_height), (*place, motion.place_height)
-    if not (robot.holding >= 0 and dist(robot.target[:2], pick) < robot.world.sizes.block / 2):
-        yield from _travel(robot, over_pick, APPROACH, suction=False)
+    yaw, motion, block = robot.yaw, robot.world.setup.motion, robot.world.sizes.block
+    grip_height = block
+    if not (robot.holding >= 0 and dist(robot.target[:2], pick) < block / 2):
+        if _top(robot) > robot.arm.home[2]:  # up first, past whatever stands beside
+            up = (*robot.target[:2], _over_all(robot, motion.pick_height))
+            yield from _travel(robot, up, RISE, suction=False)
+        yield from _travel(robot, (*pick, _over_all(robot, motion.pick_height)), APPROACH, suction=False)
         yield from _descend(robot, suction=True)
-        grip_height = robot.target[2]
-        yield from _rise(robot, over_pick, LIFT, suction=True)
+        # What was taken off another block is let go as low as what stood on the table.
+        grip_height = robot.target[2] if robot.target[2] < 1.5 * block else block
+        yield from _rise(robot, (*pick, _over_all(robot, motion.pick_height)), LIFT, suction=True)
+    over_place = (*place, _over_all(robot, motion.place_height))
     yield from _travel(robot, over_place, CARRY, suction=True, turn=turn)
     if motion.joint_speed is None:
         yield from _travel(robot, (*place, grip_height + CLEARANCE), LOWER, suction=True)
     else:
         yield from _descend(robot, suction=True)
     yield from _travel(robot, robot.target, RELEASE, suction=False)
+    over_place = (*place, _over_all(robot, motion.place_height))
     yield from _rise(robot, over_place, RISE, suction=False)
-    yield from _travel(robot, robot.arm.home, RETURN, suction=False, turn=yaw - robot.yaw)
+    home = robot.arm.home
+    if _top(robot) > home[2]:
+        yield from _travel(robot, (*home[:2], over_place[2]), RETURN, suction=False, turn=yaw - robot.yaw)
+    yield from _travel(robot, home, RETURN, suction=False, turn=yaw - robot.yaw)
+
+
+def _over_all(robot: Robot, usual: float) -> float:
+    """A height of the tip, ``usual`` or more, at which a hanging block clears whatever is not held."""
+    return min(max(usual, _top(robot) + robot.world.sizes.block + STACK_GAP), robot.arm.reach_high[2])
+
+
+def _top(robot: Robot) -> float:
+    """Height of the highest block that is not held, in metres."""
+    world = robot.world
+    loose = (i for i, body in enumerate(world.objects) if body in world.blocks and i != robot.holding)
+    return max((world.pose(index)[0][2] + world.sizes.block / 2 for index in loose), default=0.0)
 
 
 def _travel(robot: Robot, goal: Point, seconds: float, suction: bool, turn: float = 0.0) -> Iterator[Action]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import pi
+from math import dist, pi
 
 import numpy as np
 import pybullet as p
@@ -14,6 +14,7 @@ from envs.physics.simulation import Tabletop
 
 JOINTS = list(range(6))
 CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops
+HOME_TOLERANCE = 0.02  # how close to its resting place the tip must be to count as home, in metres
 FORCE = 400.0  # motor torque in N m: the arm is strong enough to follow; its dynamics are not the subject
 
 
@@ -33,6 +34,11 @@ class Robot:
         self._angles = np.array(joints)
         if holding >= 0:
             self._seal(holding)
+
+    @property
+    def is_home(self) -> bool:
+        """Whether the tip is at its resting place."""
+        return dist(self.tip(), self.arm.home) < HOME_TOLERANCE
 
     @property
     def frame_time(self) -> float:

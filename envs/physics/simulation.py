@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -19,7 +19,7 @@ from envs.geometry import BLOCK_MASS, BOWL_MASS, TABLE, Box2, Sizes
 from envs.physics.arm import Joints, arm_urdf
 from envs.physics.camera import Camera
 from envs.physics.shapes import bowl_contact_file, bowl_mesh
-from envs.scene import Scene
+from envs.scene import ObjectSpec, Scene
 from envs.scenes import Setup
 
 GRAVITY = -9.8
@@ -60,7 +60,7 @@ class Tabletop:
         self.image_size, self.physics_hz = image_size, physics_hz
         self._use(setup)
         self.bullet = _connect(gui)
-        self.arm = -1
+        self.table = self.arm = -1
         self.objects: list[int] = []
         self.steps = 0
 
@@ -95,7 +95,7 @@ class Tabletop:
             deterministicOverlappingPairs=1,
         )
         bullet.setGravity(0, 0, GRAVITY)
-        table = self._add_table()
+        self.table = self._add_table()
         self.arm = bullet.loadURDF(arm_urdf(setup.arm), useFixedBase=True)
         for link, rgb in (setup.arm.paint.links if setup.arm.paint else {}).items():
             bullet.changeVisualShape(self.arm, link, rgbaColor=_rgba(rgb))
@@ -103,7 +103,7 @@ class Tabletop:
             bullet.resetJointState(self.arm, index, angle)
         self._add_objects(scene)
         self.steps = 0
-        self._label = np.zeros(2 + max([table, self.arm, *self.objects]), dtype=np.uint8)
+        self._label = np.zeros(2 + max([self.table, self.arm, *self.objects]), dtype=np.uint8)
         self._label[self.arm + 1] = LABELS["robot"]
         for index, body in enumerate(self.objects):
             self._label[body + 1] = FIRST_OBJECT + index
@@ -189,9 +189,11 @@ class Tabletop:
             rgba = _rgba(self.setup.object_rgb(index, item.color))
             shape, mass, z = p.GEOM_MESH, BOWL_MASS, 0.0
             if item.kind == "block":
-                floor = sizes.bowl_floor if item.inside is not None else 0.0
-                floor += sizes.block if item.on is not None else 0.0
-                z = floor + sizes.block / 2 if item.height is None else item.height
+                z = (
+                    _floor(scene.objects, item, sizes) + sizes.block / 2
+                    if item.height is None
+                    else item.height
+                )
                 shape, mass = p.GEOM_BOX, BLOCK_MASS
             look = bullet.createVisualShape(shape, rgbaColor=rgba, **looks[item.kind])
             turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])
@@ -200,6 +202,13 @@ class Tabletop:
             self.objects.append(body)
         bodies = zip(self.objects, scene.objects, strict=True)
         self.blocks = {body for body, item in bodies if item.kind == "block"}
+
+
+def _floor(objects: Sequence[ObjectSpec], item: ObjectSpec, sizes: Sizes) -> float:
+    """Height of what a block stands on, in metres."""
+    if item.on is not None:
+        return _floor(objects, objects[item.on], sizes) + sizes.block
+    return sizes.bowl_floor if item.inside is not None else 0.0
 
 
 def _rgba(rgb: RGB) -> list[float]:

@@ -2,10 +2,12 @@
 
 from envs.tasks.base import Question, Relation, Task
 from envs.tasks.put_in_bowl import In
+from envs.tasks.rearrange import Rearrange
 
 TASKS: dict[str, Task] = {
     "put_block_in_bowl": Task((In(),)),
     "put_blocks_in_bowls": Task((In(),), pairs=(2, 3)),
+    "rearrange_blocks": Rearrange(),
 }
 
 __all__ = ["TASKS", "In", "Question", "Relation", "Task"]

@@ -21,7 +21,6 @@ from envs.sampling import SceneRequest, sample_objects
 from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
 CLIPORT_RADIUS = 0.05  # metres in the plane from its place within which CLIPort calls it success
-SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver
 
 
 class Question(NamedTuple):
@@ -74,6 +73,16 @@ class Task:
 
     relations: tuple[Relation, ...]
     pairs: tuple[int, int] = (1, 1)  # fewest and most of a random goal; a given instruction has 1 to the most
+    attempts: int = 3  # pick-and-places until an episode is truncated, for each pair of a random goal
+    stacks: bool = False  # whether blocks may start on each other, and pictures may be goals
+    scene_options: tuple[str, ...] = (
+        "n_objects",
+        "n_bowls",
+        "color_split",
+        "blocks_in_bowls",
+        "target_in_bowl",
+    )
+    """Reset options that describe a random scene, or its goal."""
 
     @property
     def vocabulary(self) -> tuple[str, ...]:
@@ -118,6 +127,8 @@ class Task:
             if step is None:
                 raise ValueError(f"cannot read {part!r} in the instruction {text!r}; {form}")
             _check_colors(step)
+            if step.thing == step.target:
+                raise ValueError(f"the instruction {text!r} asks for the {step.thing} {step.relation} itself")
             if step.thing in [before.thing for before in steps]:
                 raise ValueError(f"the instruction {text!r} names one {step.thing.kind} twice")
             steps.append(step)
@@ -172,6 +183,34 @@ class Task:
         """A given layout with a goal."""
         steps = [Instruction(p.relation, objects[p.thing].thing, objects[p.target].thing) for p in goal]
         return Scene(objects, goal, self.format(steps))
+
+    def fulfilled(self, world: Tabletop, robot: Robot, scene: Scene) -> list[bool]:
+        """Whether each part of the scene's goal is true now. The reward is the change in their share."""
+        return [self.relation(pair).fulfilled(world, robot, pair) for pair in scene.goal]
+
+    def succeeded(self, world: Tabletop, robot: Robot, scene: Scene) -> bool:
+        """Whether the whole goal is true now."""
+        return all(self.fulfilled(world, robot, scene))
+
+    def fulfilled_at_start(self, scene: Scene) -> bool:
+        """Whether a layout is already as its goal says."""
+        layout = scene.objects
+        return all(
+            self.relation(pair).fulfilled_at_start(layout, pair.thing, pair.target) for pair in scene.goal
+        )
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a layout with a goal that it already fulfils, or that it cannot reach."""
+        if self.fulfilled_at_start(scene):
+            raise ValueError("the layout already fulfils the instruction; ask for something else")
+
+    def with_family(self, request: SceneRequest, family: str) -> SceneRequest:
+        """The request for a scene of one of the task's families; ValueError where it has none."""
+        raise ValueError(f"this task has no families of scenes, such as {family!r}")
+
+    def picture_scene(self, objects: tuple[ObjectSpec, ...], picture: Sequence[ObjectSpec]) -> Scene:
+        """A layout with the picture of another as its goal; ValueError where the task has none."""
+        raise ValueError("this task has no pictures as goals")
 
     def open_pairs(self, objects: Sequence[ObjectSpec], color_split: ColorSplit) -> list[GoalPair]:
         """What may be asked for in a layout: its colours may be named, it is not so yet, there is room."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot
-
-import pybullet as p
 
 from envs.physics.robot import Robot
 from envs.physics.simulation import Tabletop
+from envs.physics.supports import SETTLED_SPEED, in_bowl
 from envs.scene import GoalPair, ObjectSpec
-from envs.tasks.base import SETTLED_SPEED, Relation
+from envs.tasks.base import Relation
 
 
 class In(Relation):
@@ -21,21 +19,9 @@ class In(Relation):
     exclusive = True
 
     def fulfilled(self, world: Tabletop, robot: Robot, pair: GoalPair) -> bool:
-        """Whether the block rests inside the bowl.
-
-        Its centre is within the inner rim and below the rim's height, in the bowl's own frame; the bowl
-        stands upright; the gripper has let go; nothing moves any more.
-        """
-        position, orientation = world.pose(pair.target)
-        x, y, z = p.multiplyTransforms(*p.invertTransform(position, orientation), *world.pose(pair.thing))[0]
-        upright = p.getMatrixFromQuaternion(orientation)[8] > 0.9
-        return (
-            upright
-            and hypot(x, y) < world.sizes.bowl_inner_radius
-            and 0.0 < z < world.sizes.bowl_height
-            and robot.holding != pair.thing
-            and world.speed(pair.thing) < SETTLED_SPEED
-        )
+        """Whether the block rests inside the bowl: `in_bowl` holds, the gripper has let go, nothing moves."""
+        released = robot.holding != pair.thing and world.speed(pair.thing) < SETTLED_SPEED
+        return released and in_bowl(world, pair.thing, pair.target)
 
     def fulfilled_at_start(self, objects: Sequence[ObjectSpec], thing: int, target: int) -> bool:
         return objects[thing].inside == target

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import imageio.v3 as iio
@@ -17,14 +19,17 @@ import pytest
 
 from envs import dataset
 from envs.collect import Args
+from envs.colors import SEEN
 from envs.dataset import EpisodeConfig, collect, record_episode
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks import TASKS
+from textocvp.data.episodes import EpisodeFile
 
 ROOT = Path(__file__).parents[2]
 # Small enough for CI: 16x16 pixels at 8 frames a second, in pieces of 3 episodes.
 SMALL = EpisodeConfig("val", image_size=16, render_stride=24)
+SENTENCES = replace(SMALL, policy="any-sentence", sentences=3)
 RUN = """
 import sys
 from pathlib import Path
@@ -146,6 +151,83 @@ def test_the_example_of_the_page_writes_what_is_needed(
         assert file["episode/instruction"].asstr()[1] == "put the green block in the gray bowl"
 
 
+@pytest.fixture(scope="module")
+def sentences(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """7 random sentences in 3 scenes, collected in one undisturbed run."""
+    path = tmp_path_factory.mktemp("sentences") / "val.h5"
+    collect(SENTENCES, 7, path)
+    return path
+
+
+def test_sentences_follow_each_other_in_a_scene(sentences: Path) -> None:
+    with h5py.File(sentences) as file:
+        index, task = file["episode"], TASKS["rearrange_blocks"]
+        assert index["sentence"][:].tolist() == [0, 1, 2, 0, 1, 2, 0]
+        assert index["seed"][:].tolist() == [SPLITS["val"].seed(n // 3) for n in range(7)]
+        assert json.loads(file.attrs["vocabulary"]) == list(task.vocabulary)
+        config = json.loads(file.attrs["config"])
+        assert (config["policy"], config["sentences"]) == ("any-sentence", 3)
+        before, after = index["supports_before"][:], index["supports_after"][:]
+        ends = index["start"][:] + index["length"][:]
+        for number in range(7):
+            objects = json.loads(index["objects"].asstr()[number])
+            count = len(objects)
+            assert (before[number, count:] == -3).all() and (before[number, :count] >= -2).all()
+            (step,) = task.parse(index["instruction"].asstr()[number])
+            thing, target = (
+                next(item["id"] for item in objects if (item["color"], item["kind"]) == tuple(named))
+                for named in (step.thing, step.target)
+            )
+            assert {step.thing.color, step.target.color} <= set(SEEN)
+            assert index["success"][number] == (after[number, thing] == target)
+            asked = json.loads(index["questions"].asstr()[number])
+            played = [each for each in asked if each["text"] == index["instruction"].asstr()[number]]
+            moved = np.flatnonzero(before[number] != after[number]).tolist()
+            assert moved == [each["moves"] for each in played], "the rule holds here, as nothing falls"
+            assert [after[number, each["moves"]] for each in played] == [each["ends_at"] for each in played]
+            if index["sentence"][number]:
+                assert np.array_equal(before[number], after[number - 1])
+                for name in ("frames", "segmentation", "object_position"):
+                    first, last = file[name][index["start"][number]], file[name][ends[number - 1] - 1]
+                    assert np.array_equal(first, last, equal_nan=name == "object_position"), name
+
+
+def test_the_page_names_the_fields_of_sentences(sentences: Path) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    fields = [name for name in contents(sentences) if name != "episode"]
+    assert len(fields) == 14 + 3 + 10
+    assert all(f"| `{name.removeprefix('@')}` |" in page for name in fields)
+
+
+def test_sentences_are_the_same_from_two_workers_and_in_two_runs(sentences: Path, tmp_path: Path) -> None:
+    """The first run stops in the middle of a scene."""
+    collect(SENTENCES, 4, tmp_path / "two.h5", workers=2)
+    collect(SENTENCES, 7, tmp_path / "two.h5", workers=2)
+    assert contents(tmp_path / "two.h5") == contents(sentences)
+
+
+def test_files_of_other_policies_are_not_mixed(whole: Path, sentences: Path) -> None:
+    for path, config in (
+        (whole, SENTENCES),
+        (sentences, SMALL),
+        (sentences, replace(SENTENCES, sentences=2)),
+    ):
+        with pytest.raises(ValueError, match=r"was collected with .* differs from"):
+            collect(config, 20, path)
+    with h5py.File(whole) as file:
+        assert "policy" not in json.loads(file.attrs["config"]), "as in files that are older than policies"
+
+
+def test_a_reader_finds_the_supports(whole: Path, sentences: Path) -> None:
+    with EpisodeFile(sentences) as episodes, h5py.File(sentences) as file:
+        for number, episode in enumerate(episodes):
+            count = len(episode.objects)
+            assert episode.supports is not None and len(episode.supports[0]) == count
+            assert episode.supports[1] == tuple(file["episode/supports_after"][number, :count].tolist())
+    with EpisodeFile(whole) as episodes:
+        assert episodes.episode(0).supports is None
+
+
 def test_two_workers_write_the_same_file(whole: Path, tmp_path: Path) -> None:
     collect(SMALL, 14, tmp_path / "two.h5", workers=2)
     assert contents(tmp_path / "two.h5") == contents(whole)
@@ -223,9 +305,15 @@ def test_a_file_of_version_1_is_not_appended_to(whole: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [({"episodes": 0}, "1 to 10000000"), ({"workers": 0}, "at least 1")]
+    ("arguments", "message"),
+    [
+        ({"episodes": 0}, "1 to 10000000"),
+        ({"workers": 0}, "at least 1"),
+        ({"policy": "any-sentence", "sentences_per_scene": 0}, "--sentences-per-scene must be .* at least 1"),
+        ({"sentences_per_scene": 3}, "--sentences-per-scene needs --policy any-sentence"),
+    ],
 )
-def test_wrong_arguments_are_refused(arguments: dict[str, int], message: str) -> None:
+def test_wrong_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Args(**arguments)
 

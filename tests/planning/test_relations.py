@@ -55,7 +55,7 @@ def test_a_new_relation_is_parsed(beside: Instruction) -> None:
 
 
 def test_instructions_are_checked(beside: Instruction) -> None:
-    with pytest.raises(ValueError, match="no relation 'under'; there are: in, beside"):
+    with pytest.raises(ValueError, match="no relation 'under'; there are: in, on, beside"):
         Instruction("under", RED, BLUE)
     with pytest.raises(ValueError, match="'beside' joins block and block, not red block and blue bowl"):
         Instruction("beside", RED, BLUE)
@@ -108,7 +108,7 @@ def test_one_trace_may_hold_several_relations(
     asked = [put_in("red", "blue"), beside, put_in("green", "gray")]
     rollout = oracle.rollout(parsed, [one.text for one in asked])
     grounding = grounder(parsed)
-    assert {one.relation for one in grounding.instructions()} == {"in", "beside"}
+    assert {one.relation for one in grounding.instructions()} == {"in", "on", "beside"}
     assert {one.relation for one in grounding.instructions("in")} == {"in"}
     together = measure_rollout(rollout, grounding, asked)
     assert together.within_B.tolist() == [4.0, 3.0, 4.0] and SuccessCriterion()(together).all()

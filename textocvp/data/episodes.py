@@ -49,6 +49,8 @@ class Truth:
     """The robot's label, if there is a robot."""
     objects: tuple[EpisodeObject, ...] = ()
     questions: tuple[Question, ...] = ()
+    supports: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+    """What carries each object before and after the episode: an id, -1 the table, -2 nothing that has an id."""
 
     def question(self, text: str) -> Question | None:
         """The question with this sentence, if there is one."""
@@ -244,7 +246,7 @@ class EpisodeFile(Episodes):
         return clips
 
     def truth(self, index: int) -> Truth | None:
-        """Masks, objects and questions, as far as the file has them; None without masks and objects."""
+        """Masks, objects, questions and supports, as far as the file has them; None without masks and objects."""
         number, file = self._number(index), self._open()
         masks = file["segmentation"][self._rows(number)] if "segmentation" in file else None
         items = self._json("objects", number)
@@ -261,7 +263,13 @@ class EpisodeFile(Episodes):
         elif "target" in file["episode"]:
             moves, ends_at = file["episode/target"][number].tolist()
             questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
-        return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions)
+        supports = None
+        if "supports_before" in file["episode"]:
+            before, after = (
+                file[f"episode/supports_{when}"][number, : len(objects)] for when in ("before", "after")
+            )
+            supports = (tuple(before.tolist()), tuple(after.tolist()))
+        return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions, supports=supports)
 
     @property
     def vocabulary(self) -> tuple[str, ...]:
