@@ -128,7 +128,7 @@ def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.Mon
     assert network and all(torch.equal(before[name], after[name]) for name in network)
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed >= {"parser", "renderer"}  # what its slots hold, and how they are drawn
-    with pytest.raises(SettingsError, match="parser.kind=votes"):
+    with pytest.raises(SettingsError, match=r"parser\.kind=votes"):
         train(parser_run(folder, "other", preset="tabletop-small", taught=lesson.out / "checkpoint"))
     with pytest.raises(SettingsError, match="has another network"):
         train(replace(taken, out=folder / "wide", set=("parser.channels=8",)))
