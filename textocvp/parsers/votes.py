@@ -39,6 +39,7 @@ PEAK_RADIUS = 5.0  # pixels within which there is no second object
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
+LATE_AREA = 20  # and of one that comes into sight later: what is smaller is part of something else
 UNSEEN = 0.0  # colour of a slot that holds nothing yet
 
 # What it costs to take a thing for that of a slot: log(1 + d^2), d its distance in units of three times the slot's size
@@ -273,7 +274,10 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     pieces = cost_UP[:, rest].min(0, initial=MOST_COST) < PIECE_COST
     if pieces.any():
         owner_P[rest[pieces]] = used[cost_UP[:, rest[pieces]].argmin(0)]
-    new = rest[~pieces][: len(free)]
+    new = rest[~pieces]  # all in the first frame, when no slot is used
+    if len(used):
+        new = new[mass_P1[new, 0].cpu().numpy() >= LATE_AREA]
+    new = new[: len(free)]
     owner_P[new] = free[: len(new)]
 
     # A thing that has no peak may stand where it stood, beside a larger one: it keeps the votes nearest to it.
