@@ -10,6 +10,7 @@ one background, or even light. Place, size and colour of a slot are explicit, it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -207,7 +208,7 @@ class Ballot:
 
     def elect(self, candidates_C3: Tensor) -> Tensor:
         """To which of some candidates each pixel goes (L,): the one nearest to its vote."""
-        return torch.cdist(self.votes_L3, candidates_C3).argmin(1)
+        return _apart(self.votes_L3, candidates_C3).argmin(1)
 
 
 def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: float = 4.0) -> Ballot:
@@ -219,9 +220,8 @@ def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: flo
     """
     y_L, x_L = (logits_3HW.argmax(0) == OBJECT).nonzero(as_tuple=True)
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
-    votes_L3[:, 2].clamp_(min=SMALLEST)
     some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
-    near_SS = torch.cdist(some_S3, some_S3)
+    near_SS = _apart(some_S3, some_S3)
     density_S = (
         torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1) * len(votes_L3) / max(1, len(some_S3))
     )
@@ -233,6 +233,12 @@ def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: flo
         peaks.append(int(density_S.argmax()))
         density_S = density_S.masked_fill(near_SS[peaks[-1]] < PEAK_RADIUS, 0.0)
     return Ballot(y_L, x_L, votes_L3, some_S3[peaks])
+
+
+def _apart(votes_N3: Tensor, others_M3: Tensor) -> Tensor:
+    """(N, M) how far votes are apart."""
+    lowest_3 = votes_N3.new_tensor([-math.inf, -math.inf, SMALLEST])
+    return torch.cdist(votes_N3.maximum(lowest_3), others_M3.maximum(lowest_3))
 
 
 def _pixels_of(votes_N3: Tensor) -> Tensor:
@@ -284,8 +290,8 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     missing = np.setdiff1d(used, owner_P)
     radius_M = (state.scale * state.scale.new_tensor([W / 2, H / 2])).norm(dim=-1)[missing]
     center_M2 = (state.position[missing] + 1) * state.position.new_tensor([W / 2, H / 2]) - 0.5
-    known_M3 = torch.cat([center_M2, (SIZE_UNIT * radius_M.log()).clamp_min(SMALLEST)[:, None]], 1)
-    votes_M = (torch.cdist(known_M3, ballot.votes_L3) < PEAK_RADIUS).sum(1)
+    known_M3 = torch.cat([center_M2, SIZE_UNIT * radius_M.log()[:, None]], 1)
+    votes_M = (_apart(known_M3, ballot.votes_L3) < PEAK_RADIUS).sum(1)
     there = (votes_M >= MIN_SHARE * _pixels_of(known_M3).clamp_min(MIN_AREA)).cpu().numpy()
     candidates_C3 = torch.cat([ballot.peaks_P3, known_M3[there]])
     owner_C = torch.as_tensor(np.concatenate([owner_P, missing[there]]), device=winner_L.device)

@@ -124,11 +124,12 @@ def test_a_hidden_object_keeps_its_slot_and_what_appears_takes_a_free_one() -> N
     labels = [
         scene((2, 4, 4, 5, 5), (3, 20, 20, 5, 5)),
         scene((2, 4, 4, 5, 5), (3, 20, 20, 5, 5), hidden),
-        scene((2, 4, 4, 5, 5), (3, 20, 20, 5, 5), (4, 10, 20, 4, 4)),
+        scene((2, 4, 4, 5, 5), (3, 20, 20, 5, 5), (4, 10, 20, 5, 5), (5, 28, 4, 3, 3)),
     ]
-    winners, state = parse(labels, {2: BLUE, 3: RED, 4: BLUE})
+    winners, state = parse(labels, {2: BLUE, 3: RED, 4: BLUE, 5: RED})
     assert winners[0, 5, 5] == winners[2, 5, 5] and winners[0, 21, 21] == winners[2, 21, 21]
     assert winners[2, 11, 21] == 4
+    assert winners[2, 29, 5] == 0  # too small to be something new
     slot = int(winners[0, 5, 5])
     assert torch.equal(state.position[0, 1, slot], state.position[0, 0, slot])
     assert state.presence[0, :, :, 0].sum(1).tolist() == [4, 5, 6]  # the robot comes, then the fourth thing
