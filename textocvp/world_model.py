@@ -22,7 +22,6 @@ from textocvp.inputs import (
     times_larger,
     warn_of_foreign,
 )
-from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
 from textocvp.rollout import CHUNK, Rollout
 
@@ -221,7 +220,8 @@ class WorldModel:
                 slots_BKD = self._parsed(frames_B3HW[:, None], seed, num_slots).slots[:, 0]
             # Without the first frame in mind: pixels that are carried along say nothing of the model.
             drawn = [self.model.renderer(part).frames_B3HW for part in slots_BKD.split(CHUNK)]
-            return psnr((torch.cat(drawn).clamp(-1, 1) + 1) / 2, (frames_B3HW + 1) / 2)
+            apart_B3HW = (torch.cat(drawn).clamp(-1, 1) - frames_B3HW) / 2
+            return -10 * apart_B3HW.square().mean((1, 2, 3)).clamp_min(1e-10).log10()
 
         own_B3HW = self._at_own_size(frames_B3HW)
         warn_of_foreign(own_B3HW, psnr_of(own_B3HW, parsed.slots[:, 0]), own, psnr_of, depth=depth + 1)

@@ -51,8 +51,10 @@ def test_a_picture_and_a_text_become_a_film(capsys, tmp_path, checkpoint, pictur
 def test_another_picture_size_is_refused_or_resized(capsys, tmp_path, checkpoint, picture, scene) -> None:
     iio.imwrite(tmp_path / "large.png", scene.repeat(2, axis=0).repeat(2, axis=1))
     arguments = ["rollout", str(tmp_path / "large.png"), TEXT, "--checkpoint", checkpoint, "--horizon", "2"]
-    message = says(capsys, [*arguments, "--out", str(tmp_path / "no.png")], 1)
-    assert "64x64" in message and "32x32" in message and "--resize" in message
+    iio.imwrite(tmp_path / "odd.png", scene.repeat(3, axis=0).repeat(3, axis=1)[::2, ::2])
+    refused = ["rollout", str(tmp_path / "odd.png"), *arguments[2:], "--out", str(tmp_path / "no.png")]
+    message = says(capsys, refused, 1)
+    assert "48x48" in message and "32x32" in message and "--resize" in message
     assert cli.main([*arguments, "--resize", "--out", str(tmp_path / "large-out.png")]) == 0
     assert cli.main(["rollout", picture, *arguments[2:], "--out", str(tmp_path / "same.png")]) == 0
     assert np.array_equal(iio.imread(tmp_path / "large-out.png"), iio.imread(tmp_path / "same.png"))
