@@ -49,6 +49,12 @@ class Truth:
     """The robot's label, if there is a robot."""
     objects: tuple[EpisodeObject, ...] = ()
     questions: tuple[Question, ...] = ()
+    position: NDArray[np.float32] | None = None
+    """(T, n, 3) where the n objects are, metres, in the world frame."""
+    intrinsics: NDArray[np.float64] | None = None
+    """(3, 3) of the camera, in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+    extrinsics: NDArray[np.float64] | None = None
+    """(4, 4) of the camera, world to camera, metres."""
 
     def question(self, text: str) -> Question | None:
         """The question with this sentence, if there is one."""
@@ -261,7 +267,17 @@ class EpisodeFile(Episodes):
         elif "target" in file["episode"]:
             moves, ends_at = file["episode/target"][number].tolist()
             questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
-        return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions)
+        position = intrinsics = extrinsics = None
+        if "object_position" in file:
+            position = file["object_position"][self._rows(number)][:, : len(objects)]
+        # Where the camera itself is drawn at random, the file has only the usual one.
+        factors = self._json("factors", number) or {}
+        if "camera_intrinsics" in file.attrs and not factors.keys() & {"camera_shift", "camera_zoom"}:
+            intrinsics, extrinsics = file.attrs["camera_intrinsics"], file.attrs["camera_extrinsics"]
+        return Truth(
+            segmentation=masks, robot=robot, objects=objects, questions=questions, position=position,
+            intrinsics=intrinsics, extrinsics=extrinsics,
+        )  # fmt: skip
 
     @property
     def vocabulary(self) -> tuple[str, ...]:

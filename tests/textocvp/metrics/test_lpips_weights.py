@@ -89,7 +89,7 @@ def test_anything_else_is_refused_and_nothing_is_written(
 
 def test_other_bytes_are_refused_before_they_are_read() -> None:
     content = pickle.dumps(tree())
-    with pytest.raises(LpipsWeightsError, match="tiny.ckpt has the SHA-256 .* damaged or exchanged"):
+    with pytest.raises(LpipsWeightsError, match=r"tiny\.ckpt has the SHA-256 .* damaged or exchanged"):
         tensors_of(content + b" ", backbone(content))
 
 
