@@ -109,7 +109,7 @@ def read_episode(file: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
         if "allow_pickle" in reason:
-            reason = "it holds pickled arrays, which are never loaded"
+            reason = "it is no npz file, or holds pickled arrays, which are never loaded"
         raise ValueError(f"{file}: {reason}") from error
     return arrays
 
