@@ -30,11 +30,13 @@ class Relation:
 
     @property
     def pattern(self) -> re.Pattern[str]:
-        """The template as an expression with the groups `thing` and `target`, both names of colours."""
+        """The template as an expression with the groups `thing` and `target`, both names of colours.
+
+        It also takes CLIPort's own wording, "the red blocks in a blue bowl".
+        """
         kinds = zip(("thing", "target"), self.kinds, strict=True)
-        return re.compile(
-            self.template.format(**{role: rf"(?P<{role}>[a-z]+) {kind}" for role, kind in kinds})
-        )
+        named = {role: rf"(?P<{role}>[a-z]+) {kind}s?" for role, kind in kinds}
+        return re.compile(self.template.replace("the ", "(?:the|a) ").format(**named))
 
 
 @dataclass(frozen=True)

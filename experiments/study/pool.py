@@ -25,7 +25,7 @@ class Worker:
     """What a unit of work may use, made once a process."""
 
     world_model: SlotModel  # the study's own
-    _environments: dict[tuple[Any, ...], gym.Env[Any, Any]] = field(default_factory=dict)
+    _environments: dict[Any, gym.Env[Any, Any]] = field(default_factory=dict)
     _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
 
     def model(self, load: Callable[[], Model]) -> Model:
@@ -37,7 +37,7 @@ class Worker:
 
     def environment(self, scene: StudyScene) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""
-        key = scene.steps, scene.world
+        key = scene.steps, scene.look, scene.image_size
         if key not in self._environments:
             self._environments[key] = scene.make()
         return self._environments[key]

@@ -27,20 +27,22 @@ class StudyScene:
     # for `reset`; sorted items, so that a scene can be compared and hashed
     options: tuple[tuple[str, Any], ...]
     steps: int = 1  # pairs of the goal
-    world: tuple[
-        tuple[str, Any], ...
-    ] = ()  # more arguments of the environment, as its scene and picture size
+    look: str = "simple"  # what it looks like: `scene` of the environment
+    image_size: int = 64
 
     def make(self) -> gym.Env[Any, Any]:
         """The environment it is played in, which records the frames of its motions."""
-        asked: dict[str, Any] = {"control": "primitive", "record_frames": True, **dict(self.world)}
+        options: dict[str, Any] = {"scene": self.look, "image_size": self.image_size}
         if self.steps == 1:
-            return gym.make("PutBlockInBowl-v0", **asked)
-        return gym.make("PutBlocksInBowls-v0", n_pairs=self.steps, **asked)
+            return gym.make("PutBlockInBowl-v0", control="primitive", record_frames=True, **options)
+        options["n_pairs"] = self.steps
+        return gym.make("PutBlocksInBowls-v0", control="primitive", record_frames=True, **options)
 
 
-def study_scenes(split: str, count: int, seed: int, **world: Any) -> list[StudyScene]:
-    """`count` scenes of a split, in a `world`; each `seed` chooses other ones.
+def study_scenes(
+    split: str, count: int, seed: int, look: str = "simple", image_size: int = 64
+) -> list[StudyScene]:
+    """`count` scenes of a split; each `seed` chooses other ones. Look and size: see `StudyScene`.
 
     Raises:
         ValueError: if there is no such split.
@@ -56,9 +58,7 @@ def study_scenes(split: str, count: int, seed: int, **world: Any) -> list[StudyS
     for i in range(count):
         one = source.seed(SCENES_PER_SEED * seed + first + i)
         options = source.options(one) if steps == 1 else {"n_objects": 6, "color_split": "seen"}
-        scenes.append(
-            StudyScene(split, one, tuple(sorted(options.items())), steps, tuple(sorted(world.items())))
-        )
+        scenes.append(StudyScene(split, one, tuple(sorted(options.items())), steps, look, image_size))
     return scenes
 
 

@@ -51,6 +51,12 @@ class Truth:
     questions: tuple[Question, ...] = ()
     supports: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     """What carries each object before and after the episode: an id, -1 the table, -2 nothing that has an id."""
+    position: NDArray[np.float32] | None = None
+    """(T, n, 3) where the n objects are, metres, in the world frame."""
+    intrinsics: NDArray[np.float64] | None = None
+    """(3, 3) of the camera, in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+    extrinsics: NDArray[np.float64] | None = None
+    """(4, 4) of the camera, world to camera, metres."""
 
     def question(self, text: str) -> Question | None:
         """The question with this sentence, if there is one."""
@@ -269,7 +275,17 @@ class EpisodeFile(Episodes):
                 file[f"episode/supports_{when}"][number, : len(objects)] for when in ("before", "after")
             )
             supports = (tuple(before.tolist()), tuple(after.tolist()))
-        return Truth(segmentation=masks, robot=robot, objects=objects, questions=questions, supports=supports)
+        position = intrinsics = extrinsics = None
+        if "object_position" in file:
+            position = file["object_position"][self._rows(number)][:, : len(objects)]
+        # Where the camera itself is drawn at random, the file has only the usual one.
+        factors = self._json("factors", number) or {}
+        if "camera_intrinsics" in file.attrs and not factors.keys() & {"camera_shift", "camera_zoom"}:
+            intrinsics, extrinsics = file.attrs["camera_intrinsics"], file.attrs["camera_extrinsics"]
+        return Truth(
+            segmentation=masks, robot=robot, objects=objects, questions=questions, supports=supports,
+            position=position, intrinsics=intrinsics, extrinsics=extrinsics,
+        )  # fmt: skip
 
     @property
     def vocabulary(self) -> tuple[str, ...]:

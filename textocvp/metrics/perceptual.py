@@ -1,6 +1,7 @@
 """Learned distances between pictures: LPIPS (Zhang et al. 2018) and ST-LPIPS (Ghildyal and Liu 2022).
 
-LPIPS needs the weights of AlexNet, which its library fetches on first use; ST-LPIPS has its weights in a package.
+LPIPS needs the weights of AlexNet or VGG16: `textocvp weights lpips` fetches them, else its library on first use.
+ST-LPIPS has its weights in a package.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
@@ -16,10 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from textocvp.metrics.frames import check_frames
+from textocvp.metrics.lpips_weights import BACKBONES, COMMAND, weights_path
 
 CHANNELS = (64, 192, 384, 256, 256)
 MIN_SIZE = 21
@@ -123,12 +127,18 @@ class ShiftTolerantAlexNet(nn.Module):
         return F.conv2d(padded_NCHW, self.blur.expand(C, 1, 3, 3), stride=2, groups=C)
 
 
-def load_lpips() -> PerceptualDistance:
-    """LPIPS with AlexNet, the backbone of the paper's numbers.
+def load_lpips(net: str = "alex") -> PerceptualDistance:
+    """LPIPS, by default with AlexNet, the backbone of the paper's numbers.
+
+    The weights are those that `textocvp weights lpips` has fetched; without them the library downloads torchvision's.
+
+    Args:
+        net: a key of `BACKBONES`.
 
     Raises:
-        MetricUnavailable: if the library or its weights cannot be loaded.
+        MetricUnavailable: if the library or its weights cannot be loaded; the message says how to get them.
     """
+    backbone, path = BACKBONES[net], weights_path(net)
     try:
         import lpips
     except (
@@ -143,11 +153,34 @@ def load_lpips() -> PerceptualDistance:
         # The library prints while it loads, and torchvision warns: both would end up in a study's table.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            network: Any = lpips.LPIPS(net="alex", verbose=False).eval()
-    except (OSError, RuntimeError) as error:
-        raise MetricUnavailable(f"LPIPS could not load the weights of AlexNet: {error}") from error
+            network: Any = lpips.LPIPS(net=net, pnet_rand=path.is_file(), verbose=False).eval()
+        if path.is_file():
+            _set_lpips_weights(network, load_file(path))
+    except (OSError, RuntimeError, KeyError, SafetensorError) as error:
+        raise MetricUnavailable(
+            f"LPIPS could not load the weights of {backbone.name}: {error}. `{COMMAND}` fetches them with pip and "
+            f"keeps them in {path.parent}; else the library needs a network to download torchvision's"
+        ) from error
     # The library takes two pictures at once, so their features are the pictures themselves.
-    return PerceptualDistance("LPIPS (AlexNet)", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten())
+    return PerceptualDistance(
+        f"LPIPS ({backbone.name})", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten()
+    )
+
+
+@torch.no_grad()
+def _set_lpips_weights(network: Any, tensors: Mapping[str, Tensor]) -> None:
+    """Copy weights, named as in `lpips_weights.tensors_of`, into a network of the library, all of it."""
+    convolutions = [module for module in network.net.modules() if isinstance(module, nn.Conv2d)]
+    targets = {f"layer.{i}": layer.model[-1].weight for i, layer in enumerate(network.lins)}
+    for i, convolution in enumerate(convolutions):
+        targets[f"convolution.{i}.weight"], targets[f"convolution.{i}.bias"] = (
+            convolution.weight,
+            convolution.bias,
+        )
+    if other := sorted(targets.keys() ^ tensors.keys()):
+        raise KeyError(f"the kept weights are of another network: {other[0]}")
+    for name, target in targets.items():
+        target.copy_(tensors[name].view_as(target))
 
 
 def load_st_lpips(weights: Path | None = None) -> PerceptualDistance:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from textocvp.metrics.perceptual import MetricUnavailable, load_lpips
+
+
+@pytest.fixture(autouse=True)
+def no_kept_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TEXTOCVP_CACHE", str(tmp_path))
 
 
 class MeanDifference(nn.Module):
