@@ -33,7 +33,7 @@ def perceptual(metric: str) -> PerceptualDistance:
     Raises:
         MetricUnavailable: if it cannot be had here.
     """
-    return {"lpips": load_lpips, "st_lpips": load_st_lpips}[metric]()
+    return {"lpips": lambda: load_lpips(), "st_lpips": lambda: load_st_lpips()}[metric]()
 
 
 @lru_cache
