@@ -106,6 +106,7 @@ class MeasureCommand:
     """Held-out episodes of its world, as for training; their first frames count."""
 
 
+@dataclass
 class WeightsCommand:
     """Fetch weights that a metric needs, and keep them in the cache folder ($TEXTOCVP_CACHE, else ~/.cache/textocvp).
 

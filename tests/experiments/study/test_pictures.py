@@ -87,9 +87,7 @@ def test_what_is_measured_is_where_the_block_ends(stubborn: bool) -> None:
 
 
 def test_scenes_may_be_of_another_world() -> None:
-    plain, other = (
-        study_scenes("val", 1, 0, **world)[0] for world in ({}, {"scene": "cliport", "image_size": 32})
-    )
+    plain, other = (study_scenes("val", 1, 0, *world)[0] for world in ((), ("cliport", 32)))
     worker = Worker(LoadOracle()())
     cliport = worker.environment(other)
     assert worker.environment(other) is cliport and worker.environment(plain) is not cliport
