@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -20,13 +20,13 @@ TRUST_SECONDS = 5.0  # the declared times of all parts together, as so many seco
 
 @dataclass
 class _Part:
-    """One kind of work: units in all and done, and of the timed ones how many and how long."""
+    """One kind of work."""
 
-    total: int
-    declared: float
+    total: int  # units
+    declared: float  # seconds a unit
     done: int = 0
-    timed: int = 0
-    seconds: float = 0.0
+    timed: int = 0  # units of this run
+    seconds: float = 0.0  # that those took
 
 
 class Estimate:
@@ -41,7 +41,6 @@ class Estimate:
     """
 
     def __init__(self, parts: Mapping[str, tuple[int, float]], processes: int = 1) -> None:
-        self.processes = processes
         self.parts = {n: _Part(total, seconds / processes) for n, (total, seconds) in parts.items()}
         # Processes start, and load the model, before their first unit is done: that tells nothing of the others.
         self._starting = processes
@@ -50,24 +49,23 @@ class Estimate:
         """Count a unit. Seconds since the unit before; None for one that an earlier run did."""
         part = self.parts[name]
         part.done += 1
-        if seconds is None:
-            return
-        if self._starting > 0:
+        if seconds is not None and self._starting > 0:
             self._starting -= 1
-            return
-        part.timed += 1
-        part.seconds += seconds
+        elif seconds is not None:
+            part.timed += 1
+            part.seconds += seconds
 
     def seconds_left(self) -> float:
         """Of the whole study."""
         parts = self.parts.values()
         declared = sum(part.timed * part.declared for part in parts)
         scale = (sum(part.seconds for part in parts) + TRUST_SECONDS) / (declared + TRUST_SECONDS)
-        left = 0.0
-        for part in parts:
-            believed = TRUST_UNITS * part.declared * scale
-            left += (part.total - part.done) * (believed + part.seconds) / (TRUST_UNITS + part.timed)
-        return left
+        return sum(
+            (part.total - part.done)
+            * (TRUST_UNITS * part.declared * scale + part.seconds)
+            / (TRUST_UNITS + part.timed)
+            for part in parts
+        )
 
     @property
     def share_done(self) -> float:
@@ -79,11 +77,7 @@ class Estimate:
 class StudyProgress:
     """Live tables above progress bars; plain lines when the output is a file.
 
-    Args:
-        parts: name -> (units, rough seconds of a unit on one core).
-        processes: how many units run at once.
-        console: where to draw; standard output if None.
-        clock: gives the time in seconds.
+    `parts` and `processes` are those of `Estimate`.
     """
 
     def __init__(
@@ -103,9 +97,8 @@ class StudyProgress:
         )  # fmt: skip
         self._tasks = {name: self._bars.add_task(name, total=n, left="") for name, (n, _) in parts.items()}
         self._whole = self._bars.add_task("[bold]whole study[/]", total=100, left="")
-        self._tables: Sequence[Table] = ()
-        self._live = Live(self._draw(), console=self.console, refresh_per_second=4, transient=True)
-        self._began = clock()
+        self._live = Live(self._bars, console=self.console, refresh_per_second=4, transient=True)
+        self._began = self._draw_at = clock()
 
     def __enter__(self) -> StudyProgress:
         if self.console.is_terminal:
@@ -115,15 +108,13 @@ class StudyProgress:
     def __exit__(self, *error: object) -> None:
         self._live.stop()
 
-    @property
-    def live(self) -> bool:
-        """Whether tables are seen while they fill up."""
-        return self.console.is_terminal
-
-    def show(self, *tables: Table) -> None:
-        """Draw these tables from now on."""
-        self._tables = tables
-        self._live.update(self._draw())
+    def show(self, make: Callable[[], Iterable[Table]]) -> None:
+        """Draw the tables as they are now, if anybody watches. Intervals take time, so that is not done every time."""
+        if self.console.is_terminal and (now := self._clock()) >= self._draw_at:
+            blocks = [block for table in make() for block in table.to_terminal(self.console.width, False)]
+            self._live.update(Group(*blocks, self._bars))
+            took = self._clock() - now
+            self._draw_at = self._clock() + max(2.0, 10 * took)
 
     def expect(self, part: str, total: int) -> None:
         """Say that a part has another number of units than was thought at first."""
@@ -131,28 +122,18 @@ class StudyProgress:
         self._bars.update(self._tasks[part], total=total)
 
     def track(self, part: str, units: Iterable[T], kept: int = 0) -> Iterator[T]:
-        """Pass the finished units of a part through, advancing its bar.
-
-        Args:
-            part: its name.
-            units: finished, one after another.
-            kept: how many of the first of them an earlier run did.
-        """
+        """Pass the finished units of a part through, advancing its bar. An earlier run did the first `kept` of them."""
         before = self._clock()
         for done, unit in enumerate(units, start=1):
             self._estimate.finished(part, None if done <= kept else self._clock() - before)
             left = self._estimate.seconds_left()
             self._bars.advance(self._tasks[part])
-            self._bars.update(
-                self._whole, completed=100 * self._estimate.share_done, left=f"about {left:.0f} s left"
-            )
-            total = self._estimate.parts[part].total
-            fifth = done == total or done * 5 // total != (done - 1) * 5 // total
-            if not self.console.is_terminal and fifth:
+            about, total = f"about {left:.0f} s left", self._estimate.parts[part].total
+            self._bars.update(self._whole, completed=100 * self._estimate.share_done, left=about)
+            # A file gets a line for every fifth of a part.
+            if not self.console.is_terminal and done * 5 // total != (done - 1) * 5 // total:
                 elapsed = self._clock() - self._began
-                self.console.print(
-                    f"{part}: {done}/{total}, {elapsed:.0f} s elapsed, about {left:.0f} s left"
-                )
+                self.console.print(f"{part}: {done}/{total}, {elapsed:.0f} s elapsed, {about}")
             yield unit
             before = self._clock()
 
@@ -161,7 +142,3 @@ class StudyProgress:
         for table in tables:
             for block in table.to_terminal(self.console.width):
                 self.console.print(block)
-
-    def _draw(self) -> Group:
-        blocks = [block for table in self._tables for block in table.to_terminal(self.console.width, False)]
-        return Group(*blocks, self._bars)

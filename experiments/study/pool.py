@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -11,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 import gymnasium as gym
 import torch
 from joblib import Parallel, delayed
+from joblib import cpu_count as available_cores  # noqa: F401 - for the studies
 
 from experiments.study.scenes import StudyScene
 from textocvp.protocols import LoadCheckpoint as LoadCheckpoint
@@ -48,7 +48,6 @@ class Unit(Protocol[Out]):
 
     def run(self, worker: Worker) -> Out:
         """Do the work. Must depend on nothing but the unit and the checkpoint."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -65,13 +64,6 @@ class Pool:
         else:
             parallel = Parallel(n_jobs=self.processes, return_as="generator", pre_dispatch=2 * self.processes)
             yield from parallel(delayed(_run)(self.load, unit) for unit in units)
-
-
-def available_cores() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @lru_cache(maxsize=1)

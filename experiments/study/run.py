@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import shutil
 import sys
 import tempfile
 import time
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,11 +40,7 @@ class UsageError(ValueError):
 
 @dataclass
 class StudyArgs:
-    """What every study can be told. A study's own arguments are a subclass.
-
-    Raises:
-        UsageError: if a number is out of range.
-    """
+    """What every study can be told. A study's own arguments are a subclass. UsageError if one is out of range."""
 
     checkpoint: str = "tabletop-small"
     """Bundled name, folder, or id on the Hugging Face hub."""
@@ -79,11 +75,10 @@ class StudyArgs:
         words = []
         for one in fields(self):
             value = getattr(self, one.name)
-            if one.name in ("out", "workers", "seed") or value == one.default:
-                continue
-            option = "--" + one.name.replace("_", "-")
-            values = value if isinstance(value, tuple) else (value,)
-            words += [option] if value is True else [f"{option} {_quoted(str(v))}" for v in values]
+            if one.name not in ("out", "workers", "seed") and value != one.default:
+                option = "--" + one.name.replace("_", "-")
+                values = value if isinstance(value, tuple) else (value,)
+                words += [option] if value is True else [f"{option} {_quoted(str(v))}" for v in values]
         return [*words, f"--seed {self.seed}"]
 
     def command(self, study: str) -> str:
@@ -154,7 +149,7 @@ class Study:
     args: type[StudyArgs] = StudyArgs  # class of its command line
     methods: Sequence[str] = ()  # keys of `METHODS` that are measured; those with a `model` are loaded
     # more work, that follows from what was found; may name only parts that `units` announced
-    cases: Callable[[Run, Found], Mapping[str, Sequence[Unit[Any]]]] | None = None
+    cases: Callable[[Run, Found], Mapping[str, Sequence[Unit[Any]]]] = lambda run, found: {}
     # the first figures of the report
     cards: Sequence[CardSpec] | Callable[[Run, Results], Sequence[CardSpec | Card]] = ()
     # name -> key of the row. A mapping is a promise, and what of it was not measured is an error; a function
@@ -181,8 +176,7 @@ class Run:
     """One run of a study, from the moment that folder and checkpoints are known to be there.
 
     Args:
-        study: which.
-        args: its command line.
+        study, args: which, and its command line.
         load: makes the world model; by default loads `args.checkpoint`.
         sizes: how much is measured; by default what the study makes of `args`.
         loads: key of a method -> makes its model; by default their checkpoints.
@@ -192,7 +186,7 @@ class Run:
         folder: where it writes.
         world_model: a world model to look at; units get their own.
         models: of the methods, as far as they are there.
-        missing: methods that cannot be measured, and why.
+        missing, remarks: methods that cannot be measured, and why; sentences that say so.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -224,52 +218,24 @@ class Run:
                 f"{study.horizon}"
             )
         if loads is None:
-            named = {key: METHODS[key].model for key in study.methods if METHODS[key].model}
-            named |= {
-                key: name for key, _, name in (one.partition("=") for one in args.model) if key in named
-            }
-            loads = {key: LoadCheckpoint(name) for key, name in named.items()}
+            asked = dict(one.split("=", 1) for one in args.model)
+            bundled = {key: METHODS[key].model for key in study.methods if METHODS[key].model}
+            loads = {key: LoadCheckpoint(asked.get(key, name)) for key, name in bundled.items()}
         self.models, self.missing = find_models(loads)
-        self._measures = measures
+        self.missing_keys = tuple(one.key for one in self.missing)
+        self.measures = measures or study.measures(args)
+        self.remarks = [one.text for one in self.missing] + list(filter(None, [self.measures.absent]))
 
     @cached_property
     def prepared(self) -> Any:
         """What `Study.prepare` made."""
         return self.study.prepare(self)
 
-    @cached_property
-    def measures(self) -> Measures:
-        """What of frames is measured."""
-        return self.study.measures(self.args) if self._measures is None else self._measures
-
     @property
     def checkpoint(self) -> Checkpoint:
         """The weights of the world model."""
         where = self.world_model.checkpoint
         return Checkpoint(where.name, where.sha256)
-
-    @property
-    def processes(self) -> int:
-        """How many work."""
-        return 1 if self.study.one_process else self.args.workers or available_cores()
-
-    @property
-    def command(self) -> str:
-        """What to type for the same figures."""
-        return self.args.command(self.study.name)
-
-    @property
-    def missing_keys(self) -> tuple[str, ...]:
-        """The methods that cannot be measured here."""
-        return tuple(one.key for one in self.missing)
-
-    @property
-    def remarks(self) -> list[str]:
-        """What is absent, and why."""
-        return [
-            *(one.text for one in self.missing),
-            *([self.measures.absent] if self.measures.absent else []),
-        ]
 
     @cached_property
     def identity(self) -> str:
@@ -304,57 +270,45 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
     Args:
         study: which.
         args: the command line; by default as without options.
-        doubles: `load`, `sizes`, `loads` and `measures` of `Run`.
-
-    Raises:
-        OSError, CheckpointError, UsageError: see `Run`; before any work is done.
+        doubles: `load`, `sizes`, `loads` and `measures` of `Run`, whose errors come before any work is done.
     """
     this = Run(study, args or study.args(), **doubles)
     _ = this.prepared  # may find that the model does not do
-    pool, planned = Pool(this.load, this.processes), study.units(this)
+    pool = Pool(this.load, 1 if study.one_process else this.args.workers or available_cores())
+    planned = study.units(this)
     found: dict[str, list[Any]] = {part: [] for part in planned}
     seeds: dict[str, list[int]] = {"slots": [this.args.seed]}
     kept = KeptWork(this.folder.path / "unfinished.pickle", this.identity)
     began = time.monotonic() - kept.seconds
     expected = {name: (len(part.units) or part.count, part.seconds) for name, part in planned.items()}
-    view = _LiveTables(this)
     done = False
     try:
-        with StudyProgress(expected, this.processes) as progress:
+        with StudyProgress(expected, pool.processes) as progress:
 
             def work(part: str, units: Sequence[Unit[Any]]) -> None:
                 known = kept.of(part)[: len(units)]
                 progress.expect(part, len(units))
-
-                def outcomes() -> Iterator[Any]:
-                    yield from known
-                    for outcome in pool.run(units[len(known) :]):
-                        kept.add(part, time.monotonic() - began, outcome)
-                        yield outcome
-
-                for outcome in progress.track(part, outcomes(), len(known)):
+                outcomes = chain(known, pool.run(units[len(known) :]))
+                for outcome in progress.track(part, outcomes, len(known)):
                     found[part].append(outcome)
-                    view.refresh(progress, found)
+                    if len(found[part]) > len(known):
+                        kept.add(part, time.monotonic() - began, outcome)
+                    progress.show(lambda: this.tables(study.rows(this, found)))
 
             for name, part in planned.items():
                 if part.units:
                     _note_seeds(seeds, name, part.units)
                     work(name, part.units)
-            cases = study.cases(this, found) if study.cases else {}
+            cases = study.cases(this, found)
             for name, part in planned.items():
                 if not part.units:
                     work(name, cases.get(name, ()))
         rows = list(study.rows(this, found))
         hashes = {f"checkpoint of {model.key}": model.sha256 for model in this.models}
+        versions = {**package_versions(), **hashes, **study.versions(this)}
+        seconds = round(time.monotonic() - began, 1)
         results = Results(
-            study=study.name,
-            checkpoint=this.checkpoint,
-            versions={**package_versions(), **hashes, **study.versions(this)},
-            seeds=seeds,
-            quick=this.args.quick,
-            seconds=round(time.monotonic() - began, 1),
-            rows=rows,
-            headline=this.headline(rows),
+            study.name, this.checkpoint, versions, seeds, this.args.quick, seconds, rows, this.headline(rows)
         )
         _write(this, results, found)
         done = True
@@ -387,17 +341,10 @@ def exit_in_a_line(interrupted: str) -> Iterator[None]:
 
 def _write(this: Run, results: Results, found: Found) -> None:
     study = this.study
-    made = study.cards(this, results) if callable(study.cards) else study.cards
-    cards = [card.fill(results) if isinstance(card, CardSpec) else card for card in made]
-    report = Report(
-        title=study.title,
-        question=study.question,
-        results=results,
-        cards=cards,
-        sections=study.page(this, results, found),
-        command=this.command,
-        again=study.again,
-    )
+    cards = study.cards(this, results) if callable(study.cards) else study.cards
+    filled = [card.fill(results) if isinstance(card, CardSpec) else card for card in cards]
+    sections, command = study.page(this, results, found), this.args.command(study.name)
+    report = Report(study.title, study.question, results, filled, sections, command, study.again)
     with this.folder.fill() as partial:
         report.write(partial)
         (partial / "identity.txt").write_text(this.identity + "\n", encoding="utf-8")
@@ -408,26 +355,11 @@ def _write(this: Run, results: Results, found: Found) -> None:
 def _note_seeds(seeds: dict[str, list[int]], part: str, units: Sequence[Unit[Any]]) -> None:
     """The seeds of every unit's `scene` or `scenes`, by what it was used for, and its `slot_seeds`."""
     for unit in units:
-        seeds["slots"] += [seed for seed in getattr(unit, "slot_seeds", ()) if seed not in seeds["slots"]]
-        for scene in getattr(unit, "scenes", None) or filter(None, [getattr(unit, "scene", None)]):
-            known = seeds.setdefault(f"{part}, {scene.split}", [])
-            if scene.seed not in known:
-                known.append(scene.seed)
-
-
-class _LiveTables:
-    """Tables that fill up while somebody watches. Intervals take time, so they are drawn now and then."""
-
-    def __init__(self, this: Run) -> None:
-        self.this, self.again_at = this, 0.0
-
-    def refresh(self, progress: StudyProgress, found: Found) -> None:
-        """Draw the tables anew, if it is time for that."""
-        if not progress.live or (now := time.monotonic()) < self.again_at:
-            return
-        progress.show(*self.this.tables(self.this.study.rows(self.this, found)))
-        took = time.monotonic() - now
-        self.again_at = time.monotonic() + max(2.0, 10 * took)
+        scenes = getattr(unit, "scenes", None) or filter(None, [getattr(unit, "scene", None)])
+        used = [("slots", seed) for seed in getattr(unit, "slot_seeds", ())]
+        for group, seed in used + [(f"{part}, {scene.split}", scene.seed) for scene in scenes]:
+            if seed not in (known := seeds.setdefault(group, [])):
+                known.append(seed)
 
 
 class OutputFolder:
@@ -457,14 +389,11 @@ class OutputFolder:
     @contextmanager
     def fill(self) -> Iterator[Path]:
         """A temporary folder; its files replace those of the same name here once the block ends well."""
-        partial = Path(tempfile.mkdtemp(dir=self.path, prefix=".partial-"))
-        try:
-            yield partial
-            files = sorted(p for p in partial.rglob("*") if p.is_file())
+        with tempfile.TemporaryDirectory(dir=self.path, prefix=".partial-") as partial:
+            yield Path(partial)
+            files = (p for p in Path(partial).rglob("*") if p.is_file())
             # results.json says that a study is complete, so it must be the last to appear.
             for file in sorted(files, key=lambda p: p.name == "results.json"):
                 target = self.path / file.relative_to(partial)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(file, target)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
