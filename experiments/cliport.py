@@ -34,7 +34,7 @@ from experiments.report.rows import Key, Row, mean_row, rate_row
 from experiments.report.tables import Column, Line, Paper, TableSpec
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.methods import METHODS, Method, Model
+from experiments.study.methods import METHODS, Model
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
@@ -56,11 +56,6 @@ AT_ONCE = (
 OWN_SPLITS = {"test": "6 objects", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
 PLAYERS = ("ours", "expert", "random candidate")
 TAUGHT = "ours, taught by masks"
-METHODS.setdefault(
-    TAUGHT,
-    Method(key=TAUGHT, hue=7, note="its parser learned from the simulator's masks", model="cliport-masks",
-           train="textocvp train parser --help, docs/models.md"),
-)  # fmt: skip
 MEASURED = ("ours", TAUGHT, "Non-OC", "MAGE", "true frames", "wrong text", "copy frame")
 ENDINGS = {"ours": "", "copy frame": "_copy", "true frames": "_true"}
 

@@ -134,6 +134,13 @@ METHODS: dict[str, Method] = {
             "--batch 16 --autoregressive 1.0 --horizon 20 --learning-rate 3e-4 --warmup 50",
         ),
         Method(
+            key="ours, taught by masks",
+            hue=7,
+            note="its parser learned from the simulator's masks",
+            model="cliport-masks",
+            train="textocvp train parser --preset cliport --teacher masks (docs/models.md has all three commands)",
+        ),
+        Method(
             key="ours, frames parsed",
             hue=0,
             note="our parser reads the imagined frames, as it must for models without slots",
