@@ -43,6 +43,7 @@ def test_the_files_hold_no_pickle(folder: Path) -> None:
 
 
 SHA256 = {
+    "cliport": "46d7fa83f8b896b6d363e07b37e7191fc0f40dc10618b82b821584c4f7f056d0",
     "mage-small": "2b07776f954026e6f0cb92fa9ecf2165e355bf89907f2eb3c5afadc1a4cab8ad",
     "non-oc-small": "055d230cd31d9e0a8cea7bb5df71d21f7d3447667cfabf9ab2e94b24bd1c57ef",
     "ocvp-seq-small": "fbdf969c2da3cbc0d54abec85040dc2ca983c4e9e5de51f7bcb88dcd89d5d3c1",
