@@ -16,7 +16,6 @@ import json
 import warnings
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -49,7 +48,7 @@ from textocvp.training.run import STEP_FILE
 
 # --- the runs ---------------------------------------------------------------------------------------------------------
 
-PRESETS = {"parser": "savi-small", "predictor": "tabletop-small"}
+PRESETS = {"predictor": "tabletop-small", "parser": "savi-small"}
 """Where the settings of each stage's runs start from."""
 PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}
 """What each stage of training trains."""
@@ -79,35 +78,31 @@ class AblationRun(Line):
         return f"python experiments/train_ablations.py --only {self.key}"
 
 
-def _run(stage: str, group: str, key: str, label: str, *settings: str) -> AblationRun:
-    name, note = PRESETS[stage], ", ".join(settings) or "the preset as it is"
-    return AblationRun(
-        key=key, label=label, note=note, stage=stage, group=group, preset=name, settings=settings
-    )
-
-
-NO_BIAS = "predictor.color_bias=false"
-_predictor, _parser = partial(_run, "predictor"), partial(_run, "parser", "initializer and decoder")
-GAUSSIAN, NO_PRIOR = "parser.initializer=gaussian", "renderer.mask_prior=false"
+NO_BIAS, GAUSSIAN = "predictor.color_bias=false", "parser.initializer=gaussian"
+NO_PRIOR, FIRST_SLOTS = "renderer.mask_prior=false", "initializer and decoder"
 # All predictor runs learn from the slots of one parser, from the same episodes in the same order, with as many updates;
 # parser runs likewise. Those with the lexicon also learn from recoloured scenes (`textocvp.data.slot_batches`).
-PREDICTORS = (
-    _predictor("reference", "base", "3 layers, residual, lexicon with colour bias"),
-    _predictor("depth", "layers-1", "1 layer", "predictor.layers=1"),
-    _predictor("depth", "layers-2", "2 layers", "predictor.layers=2"),
-    _predictor("depth", "layers-4", "4 layers", "predictor.layers=4"),
-    _predictor("residual", "residual-off", "no residual", "predictor.residual=false"),
-    _predictor("text", "lexicon-no-bias", "lexicon without colour bias", NO_BIAS),
-    _predictor("text", "text-transformer", "transformer from scratch", "text.kind=transformer", NO_BIAS),
-    _predictor("text", "text-minilm", "MiniLM, frozen", "text.kind=minilm", NO_BIAS),
-)
-PARSERS = (
-    _parser("savi-cluster-prior", "clusters, decoder with prior"),
-    _parser("savi-cluster", "clusters, decoder without prior", NO_PRIOR),
-    _parser("savi-gaussian-prior", "Gaussian, decoder with prior", GAUSSIAN),
-    _parser("savi-gaussian", "Gaussian, decoder without prior", GAUSSIAN, NO_PRIOR),
-)
-RUNS = PREDICTORS + PARSERS
+RUNS = tuple(
+    AblationRun(
+        stage=stage, group=group, key=key, label=label, preset=PRESETS[stage], settings=tuple(settings),
+        note=", ".join(settings) or "the preset as it is",
+    )
+    for stage, group, key, label, *settings in (
+        ("predictor", "reference", "base", "3 layers, residual, lexicon with colour bias"),
+        ("predictor", "depth", "layers-1", "1 layer", "predictor.layers=1"),
+        ("predictor", "depth", "layers-2", "2 layers", "predictor.layers=2"),
+        ("predictor", "depth", "layers-4", "4 layers", "predictor.layers=4"),
+        ("predictor", "residual", "residual-off", "no residual", "predictor.residual=false"),
+        ("predictor", "text", "lexicon-no-bias", "lexicon without colour bias", NO_BIAS),
+        ("predictor", "text", "text-transformer", "transformer from scratch", "text.kind=transformer", NO_BIAS),
+        ("predictor", "text", "text-minilm", "MiniLM, frozen", "text.kind=minilm", NO_BIAS),
+        ("parser", FIRST_SLOTS, "savi-cluster-prior", "clusters, decoder with prior"),
+        ("parser", FIRST_SLOTS, "savi-cluster", "clusters, decoder without prior", NO_PRIOR),
+        ("parser", FIRST_SLOTS, "savi-gaussian-prior", "Gaussian, decoder with prior", GAUSSIAN),
+        ("parser", FIRST_SLOTS, "savi-gaussian", "Gaussian, decoder without prior", GAUSSIAN, NO_PRIOR),
+    )
+)  # fmt: skip
+PREDICTORS, PARSERS = (tuple(run for run in RUNS if run.stage == stage) for stage in PRESETS)
 
 
 @dataclass(frozen=True)
@@ -128,11 +123,11 @@ class FoundRun:
     @property
     def line(self) -> Line:
         """Its line of a table, with its updates, or why it is absent and what trains it."""
-        if self.state == "trained":
-            updates = f"; {self.updates} updates" if self.updates else ""
-            return replace(self.run, note=self.run.note + updates)
-        note = f"{self.state}; {self.detail or f'train it: {self.run.command}'}"
-        return replace(self.run, kind="control", note=note)
+        if self.state != "trained":
+            note = f"{self.state}; {self.detail or f'train it: {self.run.command}'}"
+            return replace(self.run, kind="control", note=note)
+        updates = f"; {self.updates} updates" if self.updates else ""
+        return replace(self.run, note=self.run.note + updates)
 
 
 def find_run(run: AblationRun, runs: Path) -> FoundRun:
@@ -183,8 +178,9 @@ def runs_table(found: Iterable[FoundRun], failed: Container[str] = ()) -> Table:
     """What there is of each run; `failed` are the names of those whose training just failed."""
     made = []
     for one in found:
-        cells = ["failed" if one.run.key in failed else one.state, str(one.updates or ""), one.detail]
-        made.append(TableRow(one.run.key, [Cell(one.run.stage), *map(Cell, cells)]))
+        state = "failed" if one.run.key in failed else one.state
+        cells = (one.run.stage, state, str(one.updates or ""), one.detail)
+        made.append(TableRow(one.run.key, [Cell(text) for text in cells]))
     caption = "`python experiments/train_ablations.py --only NAME` trains one."
     return Table("Runs", ["stage", "state", "updates", "detail"], made, caption)
 
@@ -274,8 +270,7 @@ class FollowingScene:
                 rollout, ours, wrong = imagine_and_judge(
                     one.model(worker), sampled.observation["rgb"], ground, sampled.texts, self.seed
                 )
-            success_V, ends_V = ours.success_SV[0], ours.miss_SV[0] < NEAR
-            for metric, good_V in ((ENDS, ends_V), ("predicted_success", success_V)):
+            for metric, good_V in ((ENDS, ours.miss_SV[0] < NEAR), ("predicted_success", ours.success_SV[0])):
                 figures[one.name, "original", metric] = good_V[0]
                 if self.variants:
                     figures[one.name, "variants mean", metric] = good_V[1:]
@@ -332,22 +327,23 @@ def units(run: Run) -> dict[str, Part]:
     sizes, seed = run.sizes, run.args.seed
     predictors, parsers = entrants(run, "predictor"), entrants(run, "parser")
     counts = tuple(Entrant(slots_name(count), None, count) for count in sizes.slot_counts)
-    varied, played, unseen, parsed = (
-        study_scenes(split, count, seed)
-        for split, count in (
-            ("controllability", sizes.following), ("controllability", sizes.acted),
-            ("unseen_colors", sizes.unseen), ("test", sizes.parsing),
-        )
-    )  # fmt: skip
+    varied = study_scenes("controllability", max(sizes.following, sizes.acted), seed)
     counted = [scene for split in OBJECTS.values() for scene in study_scenes(split, sizes.slots, seed)]
     players = [("random candidate", None), ("expert", None), *(("ours", one.load) for one in predictors)]
-    following = [FollowingScene(scene, predictors, VARIANTS, seed, run.measures) for scene in varied]
-    following += [FollowingScene(scene, predictors, 0, seed) for scene in unseen]
-    acting = [LoopEpisode(who, scene, 0, VARIANTS, seed, load) for scene in played for who, load in players]
+    following = [
+        FollowingScene(s, predictors, VARIANTS, seed, run.measures) for s in varied[: sizes.following]
+    ]
+    following += [
+        FollowingScene(s, predictors, 0, seed) for s in study_scenes("unseen_colors", sizes.unseen, seed)
+    ]
+    acting = [
+        LoopEpisode(who, s, 0, VARIANTS, seed, load) for s in varied[: sizes.acted] for who, load in players
+    ]
+    parsed = [ParsingScene(s, parsers, seed) for s in study_scenes("test", sizes.parsing, seed)]
     return {
         "predictors": Part(following, 0.6 * len(predictors)),
         "closed loop": Part(acting, 2.0),
-        "parsers": Part([ParsingScene(scene, parsers, seed) for scene in parsed], 1.0 * len(parsers)),
+        "parsers": Part(parsed, 1.0 * len(parsers)),
         "slot counts, parsed": Part([ParsingScene(s, counts, seed) for s in counted], 0.5 * len(counts)),
         "slot counts, imagined": Part(
             [FollowingScene(s, counts, 0, seed) for s in counted], 0.2 * len(counts)
@@ -364,12 +360,10 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     )
     outcomes = [one for one in found["predictors"] if one.scene.split == "controllability" and trained]
     reached = [sum(bool(one.figures[e.name, "original", ENDS]) for e in trained) for one in outcomes]
-
+    captions = [f"{n} of {len(trained)} runs end in the bowl" for n in reached]
     clips = [
-        PredictionClip(
-            one.scene, shown, run.args.seed, "ablations", f"{n} of {len(trained)} runs end in the bowl"
-        )
-        for one, n in zip(outcomes, reached, strict=True)
+        PredictionClip(one.scene, shown, run.args.seed, "ablations", caption)
+        for one, caption in zip(outcomes, captions, strict=True)
     ]
     return {"pictures": extreme_clips(clips, [-float(n) for n in reached], run.sizes.clips)}
 
@@ -401,18 +395,21 @@ def headline(run: Run) -> dict[str, Key]:
 
 # Name in the headline -> column.
 FOLLOWING = {
-    "original": Column("original", "controllability", "original", ENDS),
-    "variants_mean": Column("three other bowls", "controllability", "variants mean", ENDS),
-    "wrong_text": Column("wrong text", "controllability", "wrong text", ENDS),
-    "unseen_colors": Column("unseen colours", "unseen_colors", "original", ENDS),
-    "closed_loop": Column("carried out", "controllability", "original", "closed_loop_success"),
-    "original_strict": Column("original, strict", "controllability", "original", "predicted_success"),
+    name: Column(title, split, variant, metric)
+    for name, title, split, variant, metric in (
+        ("original", "original", "controllability", "original", ENDS),
+        ("variants_mean", "three other bowls", "controllability", "variants mean", ENDS),
+        ("wrong_text", "wrong text", "controllability", "wrong text", ENDS),
+        ("unseen_colors", "unseen colours", "unseen_colors", "original", ENDS),
+        ("closed_loop", "carried out", "controllability", "original", "closed_loop_success"),
+        ("original_strict", "original, strict", "controllability", "original", "predicted_success"),
+    )
 }
 PARSING = {
-    metric: Column(title, "test", "true frames", metric, 1 if metric == "psnr" else 3)
-    for metric, title in {
-        "miou": "mIoU", "kept": "kept slot", "ari": "foreground ARI", "psnr": "PSNR, redrawn"
-    }.items()
+    metric: Column(title, "test", "true frames", metric, digits)
+    for metric, title, digits in (
+        ("miou", "mIoU", 3), ("kept", "kept slot", 3), ("ari", "foreground ARI", 3), ("psnr", "PSNR, redrawn", 1),
+    )
 }  # fmt: skip
 OBJECTS = {"6": "test", "8": "more_objects"}
 SLOTS = {
@@ -423,35 +420,33 @@ SLOTS = {
     )
     for objects, split in OBJECTS.items()
 }
-PREDICTOR_COLUMNS = (
-    *FOLLOWING.values(),
-    Column("other bowls, strict", "controllability", "variants mean", "predicted_success"),
-    *(
-        Column(f"{label} 9", "controllability", PICTURES, metric, 1 if metric == "psnr" else 3)
-        for metric, label in METRICS.items()
-    ),
-)
 GROUPS = {"depth": "Depth", "residual": "Residual connection", "text": "Text encoder"}
 
 
 def predictor_table(title: str, runs: Iterable[Line]) -> TableSpec:
     """Runs of stage 2, between the shipped model and who acts without a model."""
+    strict = Column("other bowls, strict", "controllability", "variants mean", "predicted_success")
+    pictures = [
+        Column(f"{label} {LENGTH}", "controllability", PICTURES, metric, 1 if metric == "psnr" else 3)
+        for metric, label in METRICS.items()
+    ]
     note = "the checkpoint that the study is given, by default the one in this package: trained several times as long"
     shipped = Line(key=SHIPPED, kind="ceiling", note=note)
-    return TableSpec(title, PREDICTOR_COLUMNS, [shipped, *runs, *lines(("random candidate", "expert"))])
+    made = [shipped, *runs, *lines(("random candidate", "expert"))]
+    return TableSpec(title, [*FOLLOWING.values(), strict, *pictures], made)
 
 
 def parser_table(runs: Iterable[Line]) -> TableSpec:
     """Runs of stage 1, below the shipped parser."""
     note = "clusters, slots with explicit place, glimpse decoder; trained longer"
     shipped = Line(key=SHIPPED, kind="ceiling", note=note)
-    return TableSpec("First slots and decoder", tuple(PARSING.values()), [shipped, *runs])
+    return TableSpec("First slots and decoder", list(PARSING.values()), [shipped, *runs])
 
 
 def slots_table(counts: Iterable[int]) -> TableSpec:
     """The shipped model with more and fewer slots than it was trained with."""
     made = [Line(key=slots_name(count), label=f"{count} slots") for count in counts]
-    return TableSpec("Slots at test time", tuple(SLOTS.values()), made)
+    return TableSpec("Slots at test time", list(SLOTS.values()), made)
 
 
 def plot_lines(name: str, spec: TableSpec, rows: Sequence[Row], label: str) -> Figure:

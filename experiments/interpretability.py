@@ -14,7 +14,7 @@ because that term alone could decide. Writes `results.json`, `report.html`, plot
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -31,10 +31,10 @@ from experiments.report.tables import Column, Line, Table, TableSpec, columns
 from experiments.study.clips import tone
 from experiments.study.judge import find_things
 from experiments.study.methods import HORIZON
-from experiments.study.pool import Unit, Worker
+from experiments.study.pool import Worker
 from experiments.study.predictions import to_uint8
 from experiments.study.run import Found, Part, Run, Study, UsageError, start
-from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes, wrong_text
+from experiments.study.scenes import StudyScene, sample_scene, study_scenes, wrong_text
 from planning import RELATIONS, AppearanceGrounder, Grounding, Instruction, SegmentationGrounder
 from textocvp import Rollout, WorldModel
 from textocvp.metrics.intervals import bootstrap_interval
@@ -43,8 +43,8 @@ from textocvp.slots import SlotState
 
 TEMPLATE = ("put", "the", "block's colour", "block", "in", "the", "bowl's colour", "bowl")
 """An instruction, word by word; a colour is one word, whatever its name."""
+COLOR_WORDS = (2, 6)  # places in it
 ROLES = ("block", "bowl")
-COLOR_WORDS = (TEMPLATE.index("block's colour"), TEMPLATE.index("bowl's colour"))
 GROUPS = ("named block", "named bowl", "arm", "other blocks", "other bowls", "table")
 """What a map of attention has a row for."""
 VARIANTS = 3
@@ -74,10 +74,6 @@ class Sizes:
 
 # --- reading attention ------------------------------------------------------------------------------------------------
 
-GLOW = np.array((255, 138, 30), dtype=np.float64)  # what is painted over a slot that attends
-_MARKS = ("\u2581", "##", "\u0120")  # how tokenizers mark the begin of a word, or its going on
-_SPECIAL = (("<", ">"), ("[", "]"))  # as in </s> and [CLS]
-
 
 def words_of(text: str) -> tuple[str, ...]:
     """`TEMPLATE` with the colours of an instruction."""
@@ -86,15 +82,9 @@ def words_of(text: str) -> tuple[str, ...]:
 
 
 def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.ndarray:
-    """Values of tokens, summed to values of the words of `TEMPLATE`; special and padding tokens are left out.
+    """Values of tokens, summed to values of the words of `TEMPLATE`: (..., L) -> (..., 8).
 
-    Args:
-        values: (..., L); L may be more than there are tokens.
-        tokens: of the text, as the encoder sees them.
-        text: an instruction.
-
-    Returns:
-        (..., 8).
+    Special tokens are left out, and what comes after the last token.
 
     Raises:
         UsageError: if the tokens do not spell the words of the text.
@@ -103,9 +93,9 @@ def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.nda
     merged = np.zeros((*values.shape[:-1], len(words)), dtype=values.dtype)
     for column, token in enumerate(tokens):
         letters = token.lower().replace(" ", "")
-        for mark in _MARKS:
+        for mark in ("\u2581", "##", "\u0120"):  # how tokenizers mark the begin of a word, or its going on
             letters = letters.removeprefix(mark)
-        if not letters or any(token.startswith(a) and token.endswith(b) for a, b in _SPECIAL):
+        if not letters or (token[0], token[-1]) in (("<", ">"), ("[", "]")):  # as in </s> and [CLS]
             continue
         if spelled[-1] == words[len(spelled) - 1]:
             spelled.append("")
@@ -141,11 +131,11 @@ def read_attention(
     attention_TnhKW: np.ndarray, present_K: np.ndarray, grounding: Grounding, asked: Instruction, ends: bool
 ) -> AttentionReading:
     """Read one rollout's attention, merged to the words of `TEMPLATE`; `ends` is for `ends_in_bowl`."""
-    slots_R, others_R = named_slots(grounding, asked), dict[str, list[int]](block=[], bowl=[])
+    slots_R, others = named_slots(grounding, asked), dict[str, list[int]](block=[], bowl=[])
     for thing, its in grounding.things.items():
         if thing not in asked.things:
-            others_R[thing.kind] += its
-    groups = [*slots_R, list(grounding.arm), *others_R.values(), list(grounding.background)]
+            others[thing.kind] += its
+    groups = [*slots_R, list(grounding.arm), *others.values(), list(grounding.background)]
     shares_R = [attention_TnhKW[..., word] for word in COLOR_WORDS]
 
     def leads(*axes: int) -> np.ndarray:
@@ -177,18 +167,9 @@ def lead(shares: np.ndarray, slots: Sequence[int], present_K: np.ndarray) -> np.
     """
     own_K = np.zeros_like(present_K)
     own_K[list(slots)] = True
-    own = np.where(own_K & present_K, shares, -np.inf).max(-1)
-    others = np.where(~own_K & present_K, shares, -np.inf).max(-1)
+    own, others = (np.where(some_K & present_K, shares, -np.inf).max(-1) for some_K in (own_K, ~own_K))
     with np.errstate(invalid="ignore"):  # no slot of either kind
         return np.where(np.isneginf(own), -np.inf, own - others)
-
-
-def named_most(
-    shares_KW: np.ndarray, grounding: Grounding, asked: Instruction, present_K: np.ndarray
-) -> list[bool]:
-    """Whether the named block and the named bowl attend most to the sentence's colour words."""
-    pairs = zip(COLOR_WORDS, named_slots(grounding, asked), strict=True)
-    return [bool(lead(shares_KW[:, word], slots, present_K) > 0) for word, slots in pairs]
 
 
 def _group_means(shares: np.ndarray, groups: Sequence[list[int]]) -> np.ndarray:
@@ -213,9 +194,8 @@ def without_color_term(model: object) -> WorldModel | None:
         return None
     network = copy.deepcopy(model.model)
     gains = [gain for name, gain in network.predictor.named_parameters() if name.endswith("color_gain_h")]
-    with torch.no_grad():
-        for gain in gains:
-            gain.zero_()
+    for gain in gains:
+        gain.data.zero_()
     return WorldModel(network, model.checkpoint) if gains else None
 
 
@@ -224,13 +204,12 @@ def without_color_term(model: object) -> WorldModel | None:
 
 @dataclass(frozen=True, eq=False)
 class AttentionOutcome:
-    """One scene, its own instruction and its variants: V texts."""
+    """What was read of a scene with V texts: its own instruction and its variants."""
 
     scene: StudyScene
-    texts: tuple[str, ...]
-    # V of `OURS`, slots named by the simulator's segmentation of the first frame, for measuring only; and the same of
-    # the model without its colour-matching term, if it has one
-    readings: Mapping[str, tuple[AttentionReading, ...]]
+    # method -> what was read, V readings, but one of `WRONG`. Slots are named by the simulator's segmentation of the
+    # first frame, for measuring only, except for `BY_APPEARANCE`.
+    readings: Mapping[str, Sequence[AttentionReading]]
     figures: Mapping[tuple[str, str, str], Any]  # see `figure_rows`
 
 
@@ -245,92 +224,67 @@ class AttentionScene:
     def run(self, worker: Worker) -> AttentionOutcome:
         """Imagine, name the slots, read the attention."""
         model = cast(WorldModel, worker.world_model)
-        sampled, parsed, truth, present_K = parse_scene(worker, self.scene, self.variants, self.seed)
+        sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
+        parsed = model.parse(sampled.observation["rgb"][None], seed=self.seed)
+        present_K = parsed.presence[0, 0].numpy() >= 0.5
         texts, wrong = sampled.texts, wrong_text(sampled)
         asked = [Instruction.parse(text) for text in texts]
-        (*attention, misread_TnhKW), rollout = imagine(model, parsed, [*texts, wrong], self.seed)
-
-        def read(attention: Sequence[np.ndarray], rollout: Rollout) -> tuple[AttentionReading, ...]:
-            ends = [ends_in_bowl(rollout, b, truth, one) for b, one in enumerate(asked)]
-            parts = zip(attention, asked, ends, strict=True)
-            return tuple(read_attention(a, present_K, truth, one, end) for a, one, end in parts)
-
-        def most(shares_VKW: Iterable[np.ndarray], things: Grounding) -> np.ndarray:
-            pairs = zip(shares_VKW, asked, strict=True)
-            return np.array([named_most(shares_KW, things, one, present_K) for shares_KW, one in pairs])
-
+        truth = SegmentationGrounder.from_info(sampled.info)(parsed)
         seen = find_things(parsed, AppearanceGrounder.from_info(sampled.info), asked) or Grounding((), ())
-        readings = {OURS: read(attention, rollout)}
-        most_VR = {BY_APPEARANCE: most((one.mean((0, 1, 2)) for one in attention), seen)}
+
+        def read(
+            attention: Sequence[np.ndarray], rollout: Rollout, things: Grounding = truth
+        ) -> list[AttentionReading]:
+            # What is read under the wrong sentence is for the scene's own.
+            return [
+                read_attention(one_TnhKW, present_K, things, one, ends_in_bowl(rollout, b, things, one))
+                for b, (one_TnhKW, one) in enumerate(zip(attention, [*asked, asked[0]], strict=False))
+            ]
+
+        attention, rollout = imagine(model, parsed, [*texts, wrong], self.seed)
+        *ours, misread = read(attention, rollout)
+        readings = {BY_APPEARANCE: read(attention[:-1], rollout, seen), OURS: ours, WRONG: [misread]}
         if (without := without_color_term(model)) is not None:
+            readings[COLOR_TERM] = read(color_term(model, parsed, texts, present_K), rollout)
             readings[NO_COLOR_TERM] = read(*imagine(without, parsed, texts, self.seed))
-            most_VR[COLOR_TERM] = most(color_term(model, parsed, texts, present_K), truth)
-        most_VR |= {method: np.array([one.most_R for one in its]) for method, its in readings.items()}
-        most_R = named_most(misread_TnhKW.mean((0, 1, 2)), truth, asked[0], present_K)
-        pairs = zip(most_R, asked[0].things, Instruction.parse(wrong).things, strict=True)
-        misled_R = [most if own != other else None for most, own, other in pairs]
-        ends = ends_in_bowl(rollout, len(asked), truth, asked[0])
-        figures = scene_figures(asked[0], readings, most_VR, misled_R, ends)
-        return AttentionOutcome(self.scene, texts, readings, figures)
+        figures = scene_figures(asked[0], Instruction.parse(wrong), readings)
+        return AttentionOutcome(self.scene, readings, figures)
 
 
 def scene_figures(
-    own: Instruction,
-    readings: Mapping[str, Sequence[AttentionReading]],
-    most_VR: Mapping[str, np.ndarray],
-    misled_R: Sequence[bool | None],
-    misled_ends: bool,
+    own: Instruction, wrong: Instruction, readings: Mapping[str, Sequence[AttentionReading]]
 ) -> dict[tuple[str, str, str], Any]:
-    """Figures of a scene.
-
-    Args:
-        own: its own instruction.
-        readings: see `AttentionOutcome`.
-        most_VR: method -> (V, R) bool, whether the named things attend most to their colour words.
-        misled_R: whether the things that `own` names attend most under a sentence that names others; None where it must
-            name the same.
-        misled_ends: whether under that sentence the block still ends in the first bowl.
-    """
+    """Figures of a scene, of its own instruction and the wrong one; see `AttentionOutcome`."""
     figures: dict[tuple[str, str, str], Any] = {}
     several = len(readings[OURS]) > 1
+    imagined = [method for method in (OURS, NO_COLOR_TERM) if method in readings]
+    read = [method for method in (BY_APPEARANCE, COLOR_TERM, *imagined) if method in readings]
     new_R = [thing.color not in SEEN for thing in own.things]
     for variant, texts, counts_R in (
         ("original", slice(0, 1), [True, True]),
         ("variants mean", slice(1, None), [several, several]),
         ("new names", slice(0, 1), new_R),  # what no training caption named
     ):
-        ours, misled = readings[OURS][texts], variant != "variants mean"
-        for r, role in enumerate(ROLES):
-            if not counts_R[r]:
-                continue
-            for method, most in most_VR.items():
-                figures[method, variant, METRICS[r]] = most[texts, r]
-            if misled and misled_R[r] is not None:
-                figures[WRONG, variant, METRICS[r]] = misled_R[r]
+        ours, misread = readings[OURS][texts], readings[WRONG][texts]
+        for r in np.flatnonzero(counts_R):
+            for method in read:
+                figures[method, variant, METRICS[r]] = [one.most_R[r] for one in readings[method][texts]]
+            if misread and own.things[r] != wrong.things[r]:
+                figures[WRONG, variant, METRICS[r]] = misread[0].most_R[r]
             figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
             margins = [one.margin_R[r] for one in ours]
             if not np.isnan(margins).all():
-                figures[OURS, variant, f"lead_{role}"] = np.nanmean(margins)
+                figures[OURS, variant, f"lead_{ROLES[r]}"] = np.nanmean(margins)
         if any(counts_R):
-            for method, its in readings.items():
-                figures[method, variant, ENDS] = [one.ends_in_bowl for one in its[texts]]
-            if misled:
-                figures[WRONG, variant, ENDS] = misled_ends
-    for method, its in readings.items() if several else ():
-        for r, n, h in np.ndindex(its[0].most_Rnh.shape):
+            for method in imagined:
+                figures[method, variant, ENDS] = [one.ends_in_bowl for one in readings[method][texts]]
+            if misread:
+                figures[WRONG, variant, ENDS] = misread[0].ends_in_bowl
+    for method in imagined if several else ():
+        for r, n, h in np.ndindex(readings[OURS][0].most_Rnh.shape):
             name = f"{method}, layer {n + 1} head {h + 1}"
-            figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in its]
+            figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in readings[method]]
     return figures
-
-
-def parse_scene(
-    worker: Worker, scene: StudyScene, variants: int, seed: int
-) -> tuple[SampledScene, Rollout, Grounding, np.ndarray]:
-    """A scene, its first frame parsed, which slot is what by the simulator's segmentation, and which are present."""
-    sampled = sample_scene(worker.environment(scene), scene, variants)
-    parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=seed)
-    truth = SegmentationGrounder.from_info(sampled.info)(parsed)
-    return sampled, parsed, truth, parsed.presence[0, 0].numpy() >= 0.5
 
 
 def imagine(
@@ -353,13 +307,12 @@ def imagine(
 def color_term(
     model: WorldModel, parsed: Rollout, texts: Sequence[str], present_K: np.ndarray
 ) -> list[np.ndarray]:
-    """What comparing each slot's colour with the lexicon's says by itself, (K, W) for each text."""
-    color_BK3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
-    matches = [
-        color_match(color_BK3, torch.from_numpy(present_K)[None], model.model.text([t])) for t in texts
-    ]
+    """What comparing each slot's colour with the lexicon's says by itself, as an attention of one step and head."""
+    color_1K3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
+    present_1K = torch.from_numpy(present_K)[None]
+    matches = [color_match(color_1K3, present_1K, model.model.text([text]))[0].numpy() for text in texts]
     pairs = zip(matches, texts, strict=True)
-    return [merge_tokens(match_BKL[0].numpy(), model.words(text), text) for match_BKL, text in pairs]
+    return [merge_tokens(match_KL, model.words(text), text)[None, None, None] for match_KL, text in pairs]
 
 
 @dataclass(frozen=True)
@@ -370,25 +323,35 @@ class AttentionPicture:
     variants: int  # see `AttentionScene`
     seed: int
     variant: int  # which of its texts
-    margin: float  # the figure it was chosen for
-    success: bool  # whether both named things attend most to their colour words
-    rank: int  # its place among the best or the worst
-    best: bool
+    reading: AttentionReading
+    best: bool = True
+    rank: int = 1  # its place among the best or the worst
+
+    @property
+    def margin(self) -> float:
+        """What it is chosen for: the smaller of the two leads. A thing without a slot is the worst case there is."""
+        return float(np.nan_to_num(self.reading.margin_R, nan=-np.inf).min())
+
+    @property
+    def success(self) -> bool:
+        """Whether both named things attend most to their colour words."""
+        return bool(self.reading.most_R.all())
 
     def run(self, worker: Worker) -> tuple[Clip, Figure | None]:
         """Imagine it once more, and paint: a clip, and for the first of each kind a map of slots and words."""
-        sampled, parsed, truth, present_K = parse_scene(worker, self.scene, self.variants, self.seed)
-        text = sampled.texts[self.variant]
-        asked, kind = Instruction.parse(text), "best" if self.best else "worst"
+        sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
+        parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=self.seed)
+        text, kind = sampled.texts[self.variant], "best" if self.best else "worst"
         (attention_TnhKW,), rollout = imagine(cast(WorldModel, worker.world_model), parsed, [text], self.seed)
         frames_THW3, masks_TKHW = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
         shares_TKW = attention_TnhKW.mean((1, 2))
         glowing = [glow(frames_THW3, masks_TKHW, shares_TKW[..., word]) for word in COLOR_WORDS]
         figure = f"lead {self.margin:.3f}" if np.isfinite(self.margin) else "a named thing has no slot"
+        things = Instruction.parse(text).things
         clip = Clip(
             name=f"attention-{kind}-{self.rank}.gif",
             gif=gif([[frames_THW3, *glowing]]),
-            panels=("imagined", *(f'"{thing.color}"' for thing in asked.things)),
+            panels=("imagined", *(f'"{thing.color}"' for thing in things)),
             title=text,
             caption=f"{self.scene.split.replace('_', ' ')}, seed {self.scene.seed}; {figure}",
             badge=f"{kind} {self.rank}: {'both attend most' if self.success else 'missed'}",
@@ -396,10 +359,11 @@ class AttentionPicture:
         )
         if self.rank > 1:
             return clip, None
-        reading = read_attention(attention_TnhKW, present_K, truth, asked, False)
-        names = [*map(str, asked.things), *GROUPS[2:]]
-        caption = f"The {kind} case: mean share over steps, layers and heads."
-        return clip, word_map(f"words-{kind}.png", [reading], names, words_of(text), caption)
+        groups, caption = (
+            [*map(str, things), *GROUPS[2:]],
+            f"The {kind} case: mean share over steps, layers and heads.",
+        )
+        return clip, word_map(f"words-{kind}.png", [self.reading], caption, groups, words_of(text))
 
 
 def glow(frames_THW3: np.ndarray, masks_TKHW: np.ndarray, shares_SK: np.ndarray) -> np.ndarray:
@@ -414,7 +378,8 @@ def glow(frames_THW3: np.ndarray, masks_TKHW: np.ndarray, shares_SK: np.ndarray)
     shares_TK = np.concatenate([shares_SK[:1], shares_SK])[: len(frames_THW3)]
     strength = np.einsum("tkhw,tk->thw", masks_TKHW, shares_TK / max(float(shares_SK.max()), 1e-9))[..., None]
     grey = 0.25 * frames_THW3.mean(-1, keepdims=True) + 24
-    return (grey * (1 - strength) + GLOW * strength).clip(0, 255).round().astype(np.uint8)
+    orange = np.array((255.0, 138.0, 30.0))
+    return (grey * (1 - strength) + orange * strength).clip(0, 255).round().astype(np.uint8)
 
 
 def check_model(run: Run) -> None:
@@ -437,35 +402,28 @@ def units(run: Run) -> dict[str, Part]:
 
 def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -> list[AttentionPicture]:
     """The cases with the largest and the smallest lead of the named things, each of another scene."""
-    chosen = []
-    # The smaller of the two leads; a thing without a slot is the worst case there is.
-    ranked = [
-        (float(np.nan_to_num(one.margin_R, nan=-np.inf).min()), bool(one.most_R.all()), v, outcome)
+    every = [
+        AttentionPicture(outcome.scene, len(outcome.readings[OURS]) - 1, seed, v, reading)
         for outcome in outcomes
-        for v, one in enumerate(outcome.readings[OURS])
+        for v, reading in enumerate(outcome.readings[OURS])
     ]
+    chosen = []
     for best in (True, False):
-        firsts: dict[int, tuple[float, bool, int, AttentionOutcome]] = {}
-        for case in sorted(ranked, key=lambda case: -case[0] if best else case[0]):
-            firsts.setdefault(case[-1].scene.seed, case)
-        for rank, (margin, success, v, outcome) in enumerate(list(firsts.values())[:count], start=1):
-            variants = VARIANTS if len(outcome.texts) > 1 else 0
-            chosen.append(AttentionPicture(outcome.scene, variants, seed, v, margin, success, rank, best))
+        firsts: dict[int, AttentionPicture] = {}
+        for case in sorted(every, key=lambda case: case.margin, reverse=best):
+            firsts.setdefault(case.scene.seed, case)
+        ranked = enumerate(list(firsts.values())[:count], start=1)
+        chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
     return chosen
-
-
-def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
-    """The best and the worst."""
-    return {"pictures": extreme_cases(found["scenes"], run.args.seed, run.sizes.clips)}
 
 
 def headline(run: Run) -> dict[str, Key]:
     """The figures that are asked for by name; those of the colour term only where the model has one."""
+    endings = {"original": "", "variants mean": "_variants", "new names": "_new_names"}
     wanted: dict[str, Key] = {}
     for metric in (*METRICS, ENDS):
         for split, variant in COLUMNS.values():
-            part = {"original": "", "variants mean": "_variants", "new names": "_new_names"}[variant]
-            wanted[f"{metric}_{split}{part}"] = (OURS, split, variant, metric)
+            wanted[f"{metric}_{split}{endings[variant]}"] = (OURS, split, variant, metric)
         for method in (NO_COLOR_TERM, WRONG, CHANCE):
             wanted[f"{metric}_{method.replace(' ', '_')}"] = (method, VARIED, "original", metric)
     return wanted
@@ -484,10 +442,9 @@ LINES = {
         Line(key=CHANCE, kind="control", hue=2, note="one guess among the slots that are present"),
     )
 }  # fmt: skip
-DOTS = [line for line in LINES.values() if line.key != COLOR_TERM]
 ATTENDS_TABLES = [
     TableSpec(
-        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), list(LINES.values())
+        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), [*LINES.values()]
     )
     for role, metric in zip(ROLES, METRICS, strict=True)
 ]
@@ -501,21 +458,42 @@ ENDS_TABLE = TableSpec(
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     rows, here = list(results.rows), [one for one in found["scenes"] if one.scene.split == VARIED]
-    readings = {method: [one for o in here for one in o.readings[method]] for method in here[0].readings}
+    readings = {
+        method: [one for o in here for one in o.readings[method]]
+        for method in (OURS, NO_COLOR_TERM)
+        if method in here[0].readings
+    }
+    ours = readings[OURS]
     # A scene's texts are not independent: one curve a scene.
     shares_NRTG = np.array([_nanmean([one.shares_RTG for one in o.readings[OURS]]) for o in here])
     most_NRT = np.array([np.mean([one.most_RT for one in o.readings[OURS]], axis=0) for o in here])
-    chance = float(np.mean([one.chance_R for one in readings[OURS]]))
+    dotted = [line for line in LINES.values() if line.key != COLOR_TERM]
     dots, curves = [], []
     for r, (role, table) in enumerate(zip(ROLES, ATTENDS_TABLES, strict=True)):
         label = f"named {role} attends most"
-        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=DOTS))
+        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=dotted))
         shares = {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)}
         caption = "Mean over scenes with its 95 % interval."
         curves.append(plot_curves(f"shares_{role}.png", shares, f"share for the {role}'s colour", caption))
     most = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
     caption = "Share of instructions in which the named thing attends most to its colour word, step by step."
-    curves.append(plot_curves("most.png", most, "attends most", caption, [(chance, "chance")]))
+    chance = (float(np.mean([one.chance_R for one in ours])), "chance")
+    curves.append(plot_curves("most.png", most, "attends most", caption, [chance]))
+    mean_over = "Mean over scenes, instructions, steps, layers and heads"
+    maps_nhGW, groups = group_maps(ours, GROUPS)
+    layers = [f"layer {n + 1}" for n in range(maps_nhGW.shape[0])]
+    heads = [f"head {h + 1}" for h in range(maps_nhGW.shape[1])]
+    titles = [[f"{layer}, {head}" for head in heads] for layer in layers]
+    by_head = []
+    for method, ending, of in ((OURS, "", ""), (NO_COLOR_TERM, "_no_colour_term", f", {NO_COLOR_TERM}")):
+        for r, role in enumerate(ROLES if method in readings else ()):
+            most_nh = np.mean([one.most_Rnh[r] for one in readings[method]], axis=0)
+            caption = f"How often the named {role} attends most to its colour word{of}."
+            name = f"heads_{role}{ending}.png"
+            by_head.append(
+                heat_map(name, most_nh, layers, heads, label="attends most", top=1.0, caption=caption)
+            )
+    together = "The same for each layer and head. All maps share one scale."
     sections = [
         Section(
             "How often does the named thing attend most?",
@@ -530,14 +508,15 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         Section(
             "Head by head",
             "The same figure for each layer and head by itself, over all instructions of these scenes.",
-            [head_figure(its, method, r) for method, its in readings.items() for r in range(len(ROLES))],
+            by_head,
         ),
         Section(
             "What each thing attends to",
             "Mean share of each thing's slots for each word: over all heads, and head by head.",
             [
-                mean_map("attention.png", readings[OURS], "all heads"),
-                head_maps(readings[OURS]),
+                word_map("attention.png", ours, f"{mean_over} (all heads)."),
+                heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE, titles,
+                          label="attention to words", caption=together),
                 *(words for _, words in found["pictures"] if words),
             ],
         ),
@@ -552,7 +531,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "attention to the block's colour word and to the bowl's.",
             [Clips([clip for clip, _ in found["pictures"]])],
         ),
-    ]
+    ]  # fmt: skip
     if NO_COLOR_TERM in readings:
         text = (
             "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
@@ -560,7 +539,8 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
             "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
         )
-        without = mean_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], "without the colour term")
+        caption = f"{mean_over} (without the colour term)."
+        without = word_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], caption)
         ends = measured(ENDS_TABLE, rows)
         sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends, without]))
     return sections
@@ -578,45 +558,26 @@ def _nanmean(values: Sequence[np.ndarray]) -> np.ndarray:
     return np.where(seen.any(0), sums / np.maximum(seen.sum(0), 1), np.nan)
 
 
+SHORT_WORDS = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
+
+
+def group_maps(readings: Sequence[AttentionReading], groups: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    """Mean maps (n, h, G, W) of the groups that there are, and their names."""
+    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
+    there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3))).tolist()
+    return maps_nhGW[:, :, there], [groups[g] for g in there]
+
+
 def word_map(
-    name: str, readings: Sequence[AttentionReading], groups: Sequence[str], words: Sequence[str], caption: str
+    name: str,
+    readings: Sequence[AttentionReading],
+    caption: str,
+    groups: Sequence[str] = GROUPS,
+    words: Sequence[str] = SHORT_WORDS,
 ) -> Figure:
     """Mean share of each group's slots for each word."""
-    map_GW = _nanmean([one.map_nhGW for one in readings]).mean((0, 1))
-    there = [g for g in range(len(groups)) if not np.isnan(map_GW[g]).any()]
-    return heat_map(
-        name, map_GW[there], [groups[g] for g in there], words, label="attention to words", caption=caption
-    )
-
-
-def mean_map(name: str, readings: Sequence[AttentionReading], what: str) -> Figure:
-    """The map of all scenes."""
-    words = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
-    caption = f"Mean over scenes, instructions, steps, layers and heads ({what})."
-    return word_map(name, readings, GROUPS, words, caption)
-
-
-def head_figure(readings: Sequence[AttentionReading], method: str, r: int) -> Figure:
-    """How often each layer and head attends most."""
-    most_nh = np.mean([one.most_Rnh[r] for one in readings], axis=0)
-    ending, of = ("", "") if method == OURS else ("_no_colour_term", f", {method}")
-    return heat_map(
-        f"heads_{ROLES[r]}{ending}.png", most_nh, [f"layer {n + 1}" for n in range(len(most_nh))],
-        [f"head {h + 1}" for h in range(most_nh.shape[1])], label="attends most", top=1.0,
-        caption=f"How often the named {ROLES[r]} attends most to its colour word{of}.",
-    )  # fmt: skip
-
-
-def head_maps(readings: Sequence[AttentionReading]) -> Figure:
-    """The map of each layer and head."""
-    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
-    there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3)))
-    layers, heads = maps_nhGW.shape[:2]
-    return heat_grid(
-        "attention_heads.png", maps_nhGW[:, :, there], [GROUPS[g] for g in there], TEMPLATE,
-        [[f"layer {n + 1}, head {h + 1}" for h in range(heads)] for n in range(layers)],
-        label="attention to words", caption="The same for each layer and head. All maps share one scale.",
-    )  # fmt: skip
+    maps_nhGW, groups = group_maps(readings, groups)
+    return heat_map(name, maps_nhGW.mean((0, 1)), groups, words, label="attention to words", caption=caption)
 
 
 def plot_curves(
@@ -637,19 +598,6 @@ def plot_curves(
 
 
 _, PLAIN, OTHERS, _, NEW = COLUMNS.values()
-CARDS = [
-    CardSpec(label, LINES[method], Column("", *place, metric), compare)
-    for label, method, place, metric, compare in (
-        ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
-        ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
-        ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
-        ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
-        ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
-        ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
-        ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
-        ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
-    )
-]
 
 STUDY = Study(
     name="interpretability",
@@ -658,11 +606,23 @@ STUDY = Study(
     sizes=lambda args: Sizes(scenes=30 if args.quick else 150, clips=10),
     prepare=check_model,
     units=units,
-    cases=cases,
+    cases=lambda run, found: {"pictures": extreme_cases(found["scenes"], run.args.seed, run.sizes.clips)},
     rows=lambda run, found: figure_rows((one.scene.split, one.figures) for one in found["scenes"]),
     tables=[*ATTENDS_TABLES, ENDS_TABLE],
     page=page,
-    cards=CARDS,
+    cards=[
+        CardSpec(label, LINES[method], Column("", *place, metric), compare)
+        for label, method, place, metric, compare in (
+            ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
+            ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
+            ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
+            ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
+            ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
+            ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
+            ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
+            ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
+        )
+    ],
     headline=headline,
 )
 

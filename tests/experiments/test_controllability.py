@@ -94,7 +94,7 @@ def test_what_is_imagined_wrongly_is_judged_wrong() -> None:
     outcome = PredictedScene(scene, 1, (0,)).run(Worker(LoadOracle(colors)()))
     ours = outcome.verdicts["ours"]
     assert not ours.success_SV.any()
-    assert outcome.verdicts["true frames"].success_SV.all() and outcome.expert_V.all()
+    assert outcome.verdicts["true frames"].success_SV.all()
     assert (ours.miss_SV > 5).all()
     worst = [clip for clip in predicted_clips([outcome], 0, 1) if not clip.best]
     assert [clip.good for clip in worst] == [False]
