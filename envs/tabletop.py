@@ -314,9 +314,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "sim_step": world.steps,
             "factors": deepcopy(self._drawn),
         }
-        if (
-            self.task.stacks
-        ):  # no arrays of as many rows as pairs, which vectorised environments could not join
+        if self.task.stacks:
+            # No arrays of as many rows as pairs, which vectorised environments could not join.
             picture = self.scene.picture
             del info["target"]
             info |= {

@@ -42,7 +42,7 @@ from experiments.study.scenes import StudyScene, study_scenes
 from planning import THRESHOLDS, Instruction, PinholeCamera, Thing
 from planning.masks import centroids
 from textocvp.data import open_episodes
-from textocvp.data.cliport import CliportEpisodes, read_episode
+from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeFile, EpisodeObject, Truth
 from textocvp.metrics import foreground_ari, object_ious
 from textocvp.rollout import Rollout
@@ -50,9 +50,8 @@ from textocvp.rollout import Rollout
 SIDE = 336  # pixels of our own scenes, as in the paper
 ALL = "all"
 LENGTHS = (9, 19)
-AT_ONCE = (
-    8  # frames that are decoded at once: masks of a whole episode at 336x336 take a quarter of a gigabyte
-)
+# Frames that are decoded at once: masks of a whole episode at 336x336 take a quarter of a gigabyte.
+AT_ONCE = 8
 OWN_SPLITS = {"test": "6 objects", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
 PLAYERS = ("ours", "expert", "random candidate")
 TAUGHT = "ours, taught by masks"
@@ -220,8 +219,8 @@ def prepare(run: Run) -> Prepared:
     problems += getattr(opened, "problems", ())
     for index, text in enumerate(opened.instructions):
         if isinstance(opened, CliportEpisodes):
-            file = opened.files[index]
-            one = Recorded(str(file), 0, str(read_episode(file)["meta"].get("task", "episodes")))
+            split = str(opened.metas[index].get("task", "episodes"))
+            one = Recorded(str(opened.files[index]), 0, split)
         else:
             split = opened.split if isinstance(opened, EpisodeFile) else ""
             one = Recorded(str(path), index, split or "episodes")
@@ -370,18 +369,24 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class EpisodeUnit:
-    """A unit of work: one episode, imagined by every model and every control."""
+class _OfEpisode:
+    """A unit of work on one episode."""
 
     source: Recorded | Own
-    models: tuple[Model, ...]
-    measures: Measures
-    seed: int
 
     @property
     def scene(self) -> StudyScene | None:
         """For the list of seeds."""
         return self.source.scene
+
+
+@dataclass(frozen=True)
+class EpisodeUnit(_OfEpisode):
+    """One episode, imagined by every model and every control."""
+
+    models: tuple[Model, ...]
+    measures: Measures
+    seed: int
 
     def run(self, worker: Worker) -> Outcome:
         """Imagine, compare, judge."""
@@ -462,19 +467,13 @@ def mask_curves(labels_THW: np.ndarray, truth: Episode) -> dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Film:
-    """A unit of work: what happened beside what ours imagines, above the masks."""
+class Film(_OfEpisode):
+    """What happened beside what ours imagines, above the masks."""
 
-    source: Recorded | Own
     seed: int
     caption: str
     best: bool
     rank: int
-
-    @property
-    def scene(self) -> StudyScene | None:
-        """For the list of seeds."""
-        return self.source.scene
 
     def run(self, worker: Worker) -> Clip:
         """Imagine it once more."""

@@ -144,7 +144,8 @@ class Rollout:
             parts = [(part, None) for part in self.slots[:, times].reshape(-1, K, D).split(at_once)]
         else:
             pairs = zip(self.slots[:, times], self.seen, strict=True)
-            parts = [(part, seen) for slots_tKD, seen in pairs for part in slots_tKD.split(CHUNK_SEEN)]
+            at_once = min(at_once, CHUNK_SEEN)
+            parts = [(part, seen) for slots_tKD, seen in pairs for part in slots_tKD.split(at_once)]
         drawn = [draw(*part) for part in parts]
         return [torch.cat(part).unflatten(0, (B, len(times))) for part in zip(*drawn, strict=True)]
 

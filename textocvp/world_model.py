@@ -22,6 +22,7 @@ from textocvp.inputs import (
     times_larger,
     warn_of_foreign,
 )
+from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
 from textocvp.rollout import CHUNK, Rollout
 
@@ -196,7 +197,8 @@ class WorldModel:
                 raise ValueError(
                     f"this rollout goes on with its own {own} slots; num_slots={num_slots} is for images"
                 )
-            if obs.layout != self.model.parser.layout or times_larger(obs.image_size, self.image_size) == 0:
+            larger = obs.seen is not None and times_larger(obs.image_size, self.image_size) > 0
+            if obs.layout != self.model.parser.layout or not (larger or obs.image_size == self.image_size):
                 raise ValueError(
                     f"this rollout was made by another model: its slots are {obs.layout} at {obs.image_size} "
                     f"pixels, this model's are {self.model.parser.layout} at {self.image_size}"
@@ -220,8 +222,7 @@ class WorldModel:
                 slots_BKD = self._parsed(frames_B3HW[:, None], seed, num_slots).slots[:, 0]
             # Without the first frame in mind: pixels that are carried along say nothing of the model.
             drawn = [self.model.renderer(part).frames_B3HW for part in slots_BKD.split(CHUNK)]
-            apart_B3HW = (torch.cat(drawn).clamp(-1, 1) - frames_B3HW) / 2
-            return -10 * apart_B3HW.square().mean((1, 2, 3)).clamp_min(1e-10).log10()
+            return psnr((torch.cat(drawn).clamp(-1, 1) + 1) / 2, (frames_B3HW + 1) / 2)
 
         own_B3HW = self._at_own_size(frames_B3HW)
         warn_of_foreign(own_B3HW, psnr_of(own_B3HW, parsed.slots[:, 0]), own, psnr_of, depth=depth + 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 
 from experiments.report.rows import Row, rate_row
@@ -20,6 +18,8 @@ from experiments.study.pool import Worker
 from experiments.study.scenes import StudyScene, sample_scene
 from planning import Instruction, Thing
 from textocvp.inputs import ForeignPictureWarning
+from textocvp.metrics import overlaps
+from textocvp.training.light import jpeg
 
 REACHED_PX = 6  # of 64: a block that ends closer than this to where the bowl's slot started is at it
 FOUND = 0.25  # IoU above which a slot holds a thing
@@ -42,13 +42,6 @@ def _shade(rgb_HW3: Picture, _: Mask, rng: np.random.Generator) -> NDArray[Any]:
     return rgb_HW3 * (1 + 0.25 * across_HW / abs(across_HW).max())[..., None]
 
 
-def _compress(rgb_HW3: Picture, _: Mask, rng: np.random.Generator) -> NDArray[Any]:
-    """JPEG of quality 75, with halved colour planes as usual."""
-    file = io.BytesIO()
-    Image.fromarray(rgb_HW3).save(file, "jpeg", quality=75)
-    return np.asarray(Image.open(file))
-
-
 def _lay_wood(rgb_HW3: Picture, table_HW: Mask, rng: np.random.Generator) -> NDArray[Any]:
     """A table of four brown planks, up to 15 % lighter or darker, with grain of deviation 10 % along them."""
     H, W = table_HW.shape
@@ -65,7 +58,7 @@ CHANGES: Mapping[str, Callable[[Picture, Mask, np.random.Generator], NDArray[Any
     "light x 1.25": lambda rgb_HW3, table_HW, rng: rgb_HW3 * 1.25,
     "light gradient 25 %": _shade,
     "noise, sigma 8": lambda rgb_HW3, table_HW, rng: rgb_HW3 + 8 * rng.standard_normal(rgb_HW3.shape),
-    "JPEG, quality 75": _compress,
+    "JPEG, quality 75": lambda rgb_HW3, table_HW, rng: jpeg(rgb_HW3, 75),
     "wooden table": _lay_wood,
 }
 """Title of a column -> what is done to the first picture."""
@@ -105,7 +98,7 @@ class ChangedScene:
         asked = Instruction.parse(sampled.texts[0])
         label_of = {Thing(item["color"], item["kind"]): item["label"] for item in sampled.info["objects"]}
         seen_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
-        block, bowl = (_best_slot(seen_HW, labels_HW == label_of[one]) for one in (asked.thing, asked.target))
+        block, bowl = (_best_slot(seen_HW, labels_HW, label_of[one]) for one in (asked.thing, asked.target))
         places_TK2 = rollout.positions[0].cpu() * 64 / rollout.image_size[0]
         reached = min(block, bowl) >= 0 and bool(
             (places_TK2[-1, block] - places_TK2[0, bowl]).norm() < REACHED_PX
@@ -114,14 +107,10 @@ class ChangedScene:
         return ChangedOutcome(self.scene, self.change, reached, warned)
 
 
-def _best_slot(seen_HW: NDArray[np.int64], true_HW: NDArray[np.bool_]) -> int:
-    """The slot whose pixels overlap a true mask best; -1 if none does by an IoU of `FOUND`."""
-    ious = {
-        slot: true_HW[seen_HW == slot].sum() / (true_HW | (seen_HW == slot)).sum()
-        for slot in np.unique(seen_HW)
-    }
-    best = max(ious, key=lambda slot: ious[slot])
-    return int(best) if ious[best] >= FOUND else -1
+def _best_slot(seen_HW: NDArray[np.int64], labels_HW: NDArray[np.uint8], label: int) -> int:
+    """The slot whose pixels overlap an object's best; -1 if none does by an IoU of `FOUND`."""
+    ious_SN, slots_S, _ = overlaps(seen_HW, labels_HW, [label], min_pixels=1)
+    return int(slots_S[ious_SN.argmax()]) if ious_SN.max(initial=0.0) >= FOUND else -1
 
 
 def change_rows(outcomes: Sequence[ChangedOutcome]) -> list[Row]:

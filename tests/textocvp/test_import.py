@@ -5,9 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 
-def test_heavy_libraries_wait_until_they_are_needed() -> None:
+
+@pytest.mark.parametrize("module", ["textocvp", "textocvp.cli", "textocvp.world_model"])
+def test_heavy_libraries_wait_until_they_are_needed(module: str) -> None:
     heavy = ("transformers", "torchmetrics", "accelerate", "lpips", "tensorboard", "matplotlib.pyplot")
-    code = f"import sys, textocvp; print([name for name in {heavy} if name in sys.modules])"
+    code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -24,6 +24,7 @@ class CliportEpisodes(Episodes):
 
     Attributes:
         files: of the episodes.
+        metas: what each file says of its episode, as `read_episode` gives it.
         problems: a line for each file that was left out.
 
     Raises:
@@ -38,7 +39,7 @@ class CliportEpisodes(Episodes):
         if not self.path.exists():
             raise FileNotFoundError(f"there is no folder or file {self.path}")
         found = sorted(self.path.glob("*.npz")) if self.path.is_dir() else [self.path]
-        usable: list[tuple[Path, str, tuple[int, ...]]] = []
+        usable: list[tuple[Path, dict[str, Any], tuple[int, ...]]] = []
         problems = []
         for file in found:
             try:
@@ -46,7 +47,7 @@ class CliportEpisodes(Episodes):
             except ValueError as error:
                 problems.append(str(error))
                 continue
-            usable.append((file, arrays["meta"]["caption"], arrays["frames"].shape))
+            usable.append((file, arrays["meta"], arrays["frames"].shape))
         sizes = Counter(shape[1] for _, _, shape in usable)
         self.image_size = max(sizes, key=lambda side: sizes[side], default=0)
         for file, _, (_, side, *_) in usable:
@@ -59,7 +60,8 @@ class CliportEpisodes(Episodes):
             why = f": {problems[0]}" if problems else ": no npz files"
             raise ValueError(f"{self.path} has no episode that can be used{why}")
         self.files = tuple(file for file, _, _ in kept)
-        self.instructions = tuple(caption for _, caption, _ in kept)
+        self.metas = tuple(meta for _, meta, _ in kept)
+        self.instructions = tuple(meta["caption"] for meta in self.metas)
         self.lengths = np.array([shape[0] for _, _, shape in kept], np.int64)
         self.problems = tuple(problems)
         for problem in problems:

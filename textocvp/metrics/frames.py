@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 
 def psnr(imagined: Tensor, real: Tensor) -> Tensor:
@@ -26,6 +25,9 @@ def ssim(imagined: Tensor, real: Tensor) -> Tensor:
     Raises:
         ValueError: if the shapes differ or are not of frames.
     """
+    # Takes seconds to import, and the world model and the command line want PSNR or nothing of this package.
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     check_frames(imagined, real)
     flat = [frames.float().reshape(-1, *frames.shape[-3:]) for frames in (imagined, real)]
     value = structural_similarity_index_measure(

@@ -25,22 +25,22 @@ from textocvp.layers import full_precision, init_relu_
 from textocvp.parsers.base import Parsed, SceneParser
 from textocvp.parsers.clustering import color_features
 from textocvp.parsers.placed import CropConfig, PlacedCorrector
-from textocvp.slots import PRESENCE_BACKGROUND, PRESENCE_THING, SlotState, moments
+from textocvp.slots import PRESENCE_BACKGROUND, PRESENCE_THING, ROBOT_SLOT, SlotState, moments
 
 BACKGROUND, OBJECT, ROBOT = 0, 1, 2  # classes of pixels
 REACH = 8.0  # pixels in which votes are written: an object's radius or so
 SIZE_UNIT = (
     12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
 )
-SMALLEST = (
-    14.3  # in that unit: smaller radii than this are alike, for a half hidden block is one block, not two
-)
+# In that unit: smaller radii than this are alike, for a half hidden block is one block, not two.
+SMALLEST = 14.3
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
 PEAK_RADIUS = 5.0  # pixels within which there is no second object
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
 LATE_AREA = 20  # and of one that comes into sight later: what is smaller is part of something else
+FIRST_THING = ROBOT_SLOT + 1  # the slots of objects are from here on
 UNSEEN = 0.0  # colour of a slot that holds nothing yet
 
 # What it costs to take a thing for that of a slot: log(1 + d^2), d its distance in units of three times the slot's size
@@ -246,13 +246,12 @@ def _pixels_of(votes_N3: Tensor) -> Tensor:
     return 6 * (2 / SIZE_UNIT * votes_N3[:, 2]).exp()
 
 
-def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, first: int = 2) -> Tensor:
+def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor) -> Tensor:
     """The slot (L,) of each of one frame's object pixels, by place, colour and size.
 
     Args:
         state: slots (K,) of the frame before.
         speed_K2: how far they moved in it.
-        first: number of the first slot for an object. What none of them knows takes an unused one.
     """
     (H, W), P = frame_3HW.shape[1:], len(ballot.peaks_P3)
     if P == 0:
@@ -269,7 +268,9 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     size_KP = (scale_P2.log().mean(-1) - state.scale.log().mean(-1, keepdim=True)).abs()
     cost_KP = torch.log1p(off_KP.square()) + COLOR_COST * torch.cdist(color_features(state.color), hue_P4)
     used_K = state.is_thing[:, 0].cpu().numpy()
-    used, free = (first + np.flatnonzero(which) for which in (used_K[first:], ~used_K[first:]))
+    used, free = (
+        FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:])
+    )
     cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
     rows, columns = linear_sum_assignment(cost_UP)
     sure = cost_UP[rows, columns] < MOST_COST
@@ -347,9 +348,9 @@ class VotesParser(SceneParser):
         """What each slot covers (B, K, H, W), which sums to 1 over the slots."""
         logits_B3HW, votes_B3HW = self.network(frames_B3HW)
         B, K = state.presence.shape[:2]
-        slot_BHW = (logits_B3HW.argmax(1) == ROBOT).long()
+        slot_BHW = ROBOT_SLOT * (logits_B3HW.argmax(1) == ROBOT)
         for b in range(B):
-            ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - 2, self.config.min_votes)
+            ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes)
             one = SlotState(*(part[b].detach() for part in vars(state).values()))
             slots_L = follow(ballot, frames_B3HW[b], one, speed_BK2[b].detach())
             slot_BHW[b, ballot.y_L, ballot.x_L] = slots_L

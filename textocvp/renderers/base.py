@@ -38,9 +38,8 @@ class Seen:
     """What a renderer keeps of the first frame of one sequence, H and W its side: a multiple of the model's."""
 
     frame_3HW: Tensor  # -1..1
-    clean_3HW: (
-        Tensor  # the same without robot and things, where nothing hides it; the rest is filled from that
-    )
+    # The same without robot and things; what they hide is filled in from what they do not.
+    clean_3HW: Tensor
     labels_HW: Tensor  # the number of the slot that each pixel belongs to, int64
     slots_KD: Tensor  # the slots of that frame
 

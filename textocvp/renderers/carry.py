@@ -22,9 +22,8 @@ from textocvp.renderers.base import Rendered, Seen
 from textocvp.renderers.glimpse import GlimpseRenderer, PictureConfig
 from textocvp.slots import ROBOT_SLOT, SlotLayout, SlotState
 
-STILL = (
-    0.75  # a thing stands where it stood if its centre is nearer to that than this many standard deviations
-)
+# A thing stands where it stood if its centre is nearer to that than this many standard deviations.
+STILL = 0.75
 BORDER = 2  # pixels around a thing, of the model's own size, whose colour may be mixed with that of the thing
 FIRST_CELLS = 12  # side of the map that the robot's decoder starts from
 

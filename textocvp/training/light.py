@@ -37,7 +37,7 @@ def relight(
         x = x + rng.uniform(0, 13) * rng.standard_normal(x.shape, np.float32)
     lit = x.round().clip(0, 255).astype(np.uint8)
     if rng.random() < 0.2:
-        lit = np.stack([_jpeg(picture, int(rng.integers(50, 95))) for picture in lit])
+        lit = np.stack([jpeg(picture, int(rng.integers(50, 95))) for picture in lit])
     if rng.random() < 0.5:
         lit, labels_THW = lit[:, :, ::-1], labels_THW[:, :, ::-1]
     return np.ascontiguousarray(lit), np.ascontiguousarray(labels_THW)
@@ -53,7 +53,8 @@ def _grain(height: int, width: int, rng: np.random.Generator) -> NDArray[np.floa
     )
 
 
-def _jpeg(picture_HW3: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+def jpeg(picture_HW3: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """A picture as JPEG brings it back, with halved colour planes as usual; `quality` is 1 to 95."""
     file = io.BytesIO()
     Image.fromarray(picture_HW3).save(file, "jpeg", quality=quality)
     return np.asarray(Image.open(file))

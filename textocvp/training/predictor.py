@@ -145,7 +145,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
         val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
         accelerator.wait_for_everyone()
         # One frame more than the past, so that every time code gets trained.
-        longest = int(max(slots.lengths.max(), val_slots.lengths.max()))
+        longest = int(slots.lengths.max())
         frames = model.config.predictor.window + 1 if causal else longest
         if longest > frames and accelerator.is_main_process:
             warnings.warn(
