@@ -8,7 +8,6 @@ robot IoU .90, followed .95.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from PIL import Image
 
 from textocvp.data import open_episodes
 from textocvp.model import TextOCVP
 from textocvp.training.evaluate_parser import measure_parser
+from textocvp.training.light import jpeg
 
 Frames = NDArray[np.uint8]
 WOOD = (133, 94, 66)  # RGB
@@ -53,13 +52,6 @@ def noise(frames: Frames) -> Frames:
     return _picture(frames + 8 * np.random.default_rng(0).standard_normal(frames.shape))
 
 
-def jpeg(frames: Frames) -> Frames:
-    files = [io.BytesIO() for _ in frames]
-    for frame, file in zip(frames, files, strict=True):
-        Image.fromarray(frame).save(file, "jpeg", quality=75)
-    return np.stack([np.asarray(Image.open(file)) for file in files])
-
-
 def wood(frames: Frames) -> Frames:
     """Everything that has the table's colour in the first frame's lower middle becomes a wooden board."""
     H, W = frames.shape[1:3]
@@ -81,7 +73,7 @@ LIGHTS: dict[str, Callable[[Frames], Frames]] = {
     "brightness x 1.25": gain(1.25),
     "gradient of 25 %": gradient,
     "noise of sigma 8": noise,
-    "JPEG, quality 75": jpeg,
+    "JPEG, quality 75": lambda frames: np.stack([jpeg(frame, 75) for frame in frames]),
     "wooden table": wood,
 }
 
