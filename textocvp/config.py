@@ -34,6 +34,7 @@ class ModelConfig:
         "renderer": RENDERERS,
         "text": ENCODERS,
         "predictor": PREDICTORS,
+        "outcome": PREDICTORS,
     }
 
     name: str  # the preset it came from
@@ -41,6 +42,9 @@ class ModelConfig:
     renderer: RendererConfig = field(default_factory=GlimpseConfig)
     text: TextConfig = field(default_factory=WordsConfig)
     predictor: PredictorConfig = field(default_factory=TextOCVPConfig)
+    # A second predictor, whose one step is a whole sentence: it says where everything ends. None where it has not been
+    # trained.
+    outcome: PredictorConfig | None = None
     # The last stage of training that it has been through. After `parser`, text encoder and predictor are as drawn.
     stage: Literal["parser", "predictor"] = "predictor"
     # What pictures of its world are like, for a warning about others; None where nobody measured it.
@@ -76,16 +80,16 @@ def build(cls: type[C], data: Any, path: str = "") -> C:
             raise ValueError(
                 f"{path or 'the configuration'} has no field {name!r}; known: {', '.join(known)}"
             )
-    values = {}
+    values: dict[str, Any] = {}
     for name, one in known.items():
         where = f"{path}.{name}" if path else name
         if name not in data:
             if one.default is MISSING and one.default_factory is MISSING:
                 raise ValueError(f"{where} is missing")
-        elif name in kinds:
-            values[name] = build(config_class(kinds[name], data[name], where), data[name], where)
         elif data[name] is None and type(None) in get_args(hints[name]):
             values[name] = None
+        elif name in kinds:
+            values[name] = build(config_class(kinds[name], data[name], where), data[name], where)
         elif nested := [hint for hint in (hints[name], *get_args(hints[name])) if is_dataclass(hint)]:
             values[name] = build(nested[0], data[name], where)  # type: ignore[arg-type]
         else:

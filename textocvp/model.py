@@ -26,6 +26,7 @@ from textocvp.config import ModelConfig
 from textocvp.parsers import build_parser
 from textocvp.parsers.votes import VotesConfig
 from textocvp.predictors import build_predictor
+from textocvp.predictors.base import SlotPredictor
 from textocvp.renderers import build_renderer
 from textocvp.renderers.carry import CarryConfig
 from textocvp.renderers.glimpse import PictureConfig
@@ -42,6 +43,8 @@ class TextOCVP(
 ):
     """The text-conditioned object-centric video predictor: `parser`, `text`, `predictor`, `renderer`.
 
+    Where its config has an `outcome`, it also has a second predictor of that name.
+
     Args:
         text_files: the text encoder's own folder, of a checkpoint that is being loaded.
 
@@ -56,6 +59,9 @@ class TextOCVP(
         self.text = build_text_encoder(config.text, text_files)
         self.config = replace(config, text=self.text.config)  # says which frozen weights these are
         self.predictor = build_predictor(config.predictor, config.parser.layout, config.text.dim)
+        self.outcome: SlotPredictor | None = None
+        if config.outcome is not None:
+            self.outcome = build_predictor(config.outcome, config.parser.layout, config.text.dim)
         self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
 
     @property
@@ -124,14 +130,18 @@ def check_parts(config: ModelConfig) -> None:
             if has != wanted:
                 way = f"set renderer.{name}={wanted}"
                 raise ValueError(f"renderer.{name} is {has}, the encoder's features have {wanted}: {way}")
-    if getattr(config.predictor, "color_bias", False):  # an option of predictors that attend to the text
+    for name in ("predictor", "outcome"):
+        if not getattr(
+            getattr(config, name), "color_bias", False
+        ):  # an option of predictors that attend to the text
+            continue
         needs = ""
         if not text.words_have_rgb:
             needs = f"words that carry RGB, which is text.kind=lexicon, not {text.kind!r}"
         elif not layout.explicit:
             needs = "slots with explicit colour (parser.layout.explicit = true)"
         if needs:
-            raise ValueError(f"predictor.color_bias=true needs {needs}: set predictor.color_bias=false")
+            raise ValueError(f"{name}.color_bias=true needs {needs}: set {name}.color_bias=false")
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from textocvp.inputs import (
 )
 from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
+from textocvp.predictors.base import SlotPredictor
 from textocvp.rollout import CHUNK, Rollout
 
 __all__ = ["DEFAULT_CHECKPOINT", "Checkpoint", "WorldModel", "bundled_checkpoints"]
@@ -119,15 +120,52 @@ class WorldModel:
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
             warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=2)
-        texts = checked_texts(text, self.model.text)
+        return self._imagined(self.model.predictor, obs, text, horizon, seed, num_slots, attention)
+
+    @torch.no_grad()
+    def outcome(
+        self,
+        obs: Mapping[str, Any] | np.ndarray | Rollout,
+        text: str | Sequence[str],
+        *,
+        seed: int = 0,
+        num_slots: int | None = None,
+    ) -> Rollout:
+        """Imagine at once where a sentence leads, without the way there. Arguments and errors as `rollout`.
+
+        Returns:
+            A rollout of two frames: the parsed observation, and how it looks when the sentence has been carried out.
+
+        Raises:
+            NotImplementedError: if the model has no predictor of whole sentences.
+        """
+        if self.model.outcome is None:
+            raise NotImplementedError(
+                f"{self.checkpoint.name} cannot foresee outcomes in one step; "
+                "`textocvp train predictor --outcome` teaches it"
+            )
+        return self._imagined(self.model.outcome, obs, text, 1, seed, num_slots)
+
+    def _imagined(
+        self,
+        predictor: SlotPredictor,
+        obs: Mapping[str, Any] | np.ndarray | Rollout,
+        text: str | Sequence[str],
+        horizon: int,
+        seed: int,
+        num_slots: int | None,
+        attention: bool = False,
+    ) -> Rollout:
+        """`rollout` with one of the model's predictors."""
+        texts = checked_texts(text, self.model.text, depth=4)
         hint = ". To see further, go on from where a rollout ended: rollout(previous_rollout, text)"
-        checked_horizon(horizon, self.longest_horizon, hint)
+        checked_horizon(horizon, predictor.config.window if predictor.config.causal else None, hint)
         start = self._start(obs, seed, num_slots)
         B = checked_pairs(len(start), len(texts))
         texts = texts * B if len(texts) == 1 else texts
         seed_B1KD = start.slots[:, -1:].to(self.model.device).expand(B, -1, -1, -1)
         tokens = self.model.text(texts)
-        imagined = self.model.predictor.rollout(seed_B1KD, tokens, horizon, return_attention=attention)
+        imagined = predictor.rollout(seed_B1KD, tokens, horizon, return_attention=attention)
         slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
         seen = start.seen * B if start.seen is not None and len(start) == 1 else start.seen
         attention_BSnhKL = imagined.attention_BSnhKL
@@ -206,7 +244,7 @@ class WorldModel:
             return obs
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device, multiples=True)
         parsed = self._parsed(frames_B3HW[:, None], seed, num_slots)
-        self._warn_of_foreign(frames_B3HW, parsed, seed, num_slots, depth=4)
+        self._warn_of_foreign(frames_B3HW, parsed, seed, num_slots, depth=5)
         return parsed
 
     def _warn_of_foreign(

@@ -46,6 +46,7 @@ class SlotBatches:
         layout: what their numbers mean.
         text: looks the sentences up; its weights are not used.
         frames: T. Shorter episodes stay in their last frame, in which nothing moves; longer ones are cut.
+        every: only every so-manyth frame is taken.
         recolor: permute the colour channels, where slots have explicit colour and the words of `text` have RGB.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
         place_jitter: standard deviation of the noise of `noisy`, in -1..1.
@@ -57,6 +58,7 @@ class SlotBatches:
         layout: SlotLayout,
         text: TextEncoder,
         frames: int,
+        every: int = 1,
         *,
         recolor: bool = True,
         color_jitter: float = 0.03,
@@ -64,7 +66,7 @@ class SlotBatches:
     ) -> None:
         self.layout, self.recolor = layout, recolor and layout.explicit and text.words_have_rgb
         self.color_jitter, self.place_jitter = color_jitter, place_jitter
-        self._slots_ETKD = padded(cache, frames)
+        self._slots_ETKD = padded(cache, frames, every)
         self._words = text.lookup(cache.instructions).to("cpu")
 
     def __len__(self) -> int:
@@ -120,9 +122,9 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -
     return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)) * deviation
 
 
-def padded(slots: FrameCache, frames: int) -> Tensor:
-    """All episodes at one length (E, T, K, D), as stored: the last frame repeated, or cut."""
-    return torch.from_numpy(slots.at(np.arange(len(slots)), np.arange(frames)))
+def padded(slots: FrameCache, frames: int, every: int = 1) -> Tensor:
+    """All episodes at one length (E, T, K, D), as stored: every `every`-th frame, then the last again, or cut."""
+    return torch.from_numpy(slots.at(np.arange(len(slots)), every * np.arange(frames)))
 
 
 def true_frames(

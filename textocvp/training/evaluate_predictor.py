@@ -1,7 +1,8 @@
 """Does the imagined object end where the sentence says? Measured on held-out episodes, whose questions are asked.
 
 The first frame's true masks say which slot holds which object; nothing is trained on that. Episodes without masks or
-questions, and slots without explicit places, are measured by how far imagined slots are from parsed ones.
+questions, and slots without explicit places, are measured by how far imagined slots are from parsed ones. A predictor
+of whole sentences is measured by how often everything ends where it should.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from textocvp.data.slot_batches import padded
 from textocvp.layers import pixel_grid
 from textocvp.metrics.intervals import Interval, bootstrap_interval
 from textocvp.model import TextOCVP, evaluating
+from textocvp.predictors.base import SlotPredictor
 from textocvp.slots import SlotLayout, SlotState
 from textocvp.training.losses import MOVES
 from textocvp.training.run import Metrics
 
 PIXEL = 2 / 64  # the thresholds are for 64x64 frames; in -1..1
 REACHED = 6 * PIXEL  # an object that ends closer than this to where the other's slot started is at it
+RIGHT = 3 * PIXEL  # a slot that is foreseen to end closer than this to where it ends is foreseen
 MATCHED = 4 * PIXEL  # a slot farther than this from an object's centroid does not hold it
 BATCH = 64  # rollouts at a time
 
@@ -84,6 +87,28 @@ class SlotErrors(Metrics):
 
 
 @dataclass(frozen=True)
+class Outcomes(Metrics):
+    """How well the ends of sentences are foreseen from their beginnings.
+
+    Attributes:
+        right: share of held-out episodes in which every slot ends where it should.
+        error_px: median distance of slots that move from where they end, pixels of 64.
+        episodes: how many were tried.
+    """
+
+    group: ClassVar[str] = "outcomes"
+
+    right: float
+    error_px: float
+    episodes: int
+
+    def __str__(self) -> str:
+        return (
+            f"all ends right {self.right:.3f}, median error {self.error_px:.2f} px ({self.episodes} episodes)"
+        )
+
+
+@dataclass(frozen=True)
 class Trial:
     """A sentence for an episode, the slot that should move, and that at which it should end; -1 if there is none."""
 
@@ -132,8 +157,10 @@ class HeldOut:
     trials: Trials
 
     @classmethod
-    def of(cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int) -> HeldOut:
-        """Held-out episodes at a length of so many frames."""
+    def of(
+        cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, every: int = 1
+    ) -> HeldOut:
+        """Held-out episodes at a length of so many frames, counting every `every`-th."""
         rng, trials = np.random.default_rng(0), Trials()
         for index in range(len(episodes)) if layout.explicit else ():
             truth = episodes.truth(index)
@@ -146,7 +173,7 @@ class HeldOut:
                 for item in truth.objects
             }
             trials.add(index, played, truth.questions, slot_of, rng)
-        return cls(padded(slots, frames).float(), episodes.instructions, layout, trials)
+        return cls(padded(slots, frames, every).float(), episodes.instructions, layout, trials)
 
     @property
     def file(self) -> str:
@@ -156,6 +183,30 @@ class HeldOut:
     def measure(self, model: TextOCVP, count: int | None = None) -> InstructionFollowing | SlotErrors:
         """Figures of the first `count` episodes (default: all)."""
         return (_following if self.trials.original else _slot_errors)(model, self, count)
+
+
+def measure_outcomes(model: TextOCVP, held: HeldOut, count: int | None = None) -> Outcomes:
+    """Figures of `model.outcome` on the first `count` episodes (default: all), each given as its first and last frame.
+
+    Raises:
+        ValueError: if slots have no explicit places.
+    """
+    if not held.layout.explicit:
+        raise ValueError(f"{NO_PLACES}, and so none of the ends of sentences")
+    true_E2KD = held.slots_ETKD[:count]
+    foreseen = _imagine(model, true_E2KD, held.instructions[:count], model.outcome)
+    foreseen_EKD = torch.cat(list(foreseen))
+    true, position_EK2 = (
+        SlotState.split(true_E2KD, held.layout),
+        SlotState.split(foreseen_EKD, held.layout).position,
+    )
+    error_EK = (position_EK2 - true.position[:, 1]).norm(dim=-1)
+    thing_EK = true.is_thing[:, 0, :, 0]
+    moves_EK = thing_EK & ((true.position[:, 1] - true.position[:, 0]).norm(dim=-1) > MOVES)
+    right_E = (error_EK < RIGHT) | ~thing_EK
+    errors = error_EK[moves_EK].numpy() / PIXEL
+    error_px = float(np.median(errors)) if len(errors) else math.nan
+    return Outcomes(_share(right_E.all(1).tolist()), error_px, len(right_E))
 
 
 def place_and_size(mask_HW: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -228,13 +279,16 @@ def _slot_error(imagined_SKD: Tensor, true_TKD: Tensor, layout: SlotLayout) -> f
 
 
 @torch.no_grad()
-def _imagine(model: TextOCVP, slots_NTKD: Tensor, sentences: Sequence[str]) -> Iterator[Tensor]:
-    """The slots (T - 1, K, D) that follow each first frame."""
+def _imagine(
+    model: TextOCVP, slots_NTKD: Tensor, sentences: Sequence[str], predictor: SlotPredictor | None = None
+) -> Iterator[Tensor]:
+    """The slots (T - 1, K, D) that follow each first frame, imagined by the model's predictor or another."""
+    predictor = predictor or model.predictor
     for at in range(0, len(sentences), BATCH):
         first_B1KD = slots_NTKD[at : at + BATCH, :1].to(model.device)
         with evaluating(model):
             text = model.text(sentences[at : at + BATCH])
-            rollout = model.predictor.rollout(first_B1KD, text, slots_NTKD.shape[1] - 1)
+            rollout = predictor.rollout(first_B1KD, text, slots_NTKD.shape[1] - 1)
         yield from rollout.slots_BSKD.float().cpu()
 
 

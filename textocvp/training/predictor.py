@@ -7,6 +7,9 @@ Every episode is parsed once. The `causal` form then learns from all frames of a
 teacher forced. Later it imagines a growing part of the episode, and predicts the true next frames from its own
 imagined ones (dataset aggregation, Ross et al. 2011). The published `window` form sees both ways, so it cannot be
 teacher forced in one pass: it learns from rollouts, and the gradient flows back through them.
+
+With `--outcome` a second predictor learns, from the first slots of an episode, its last ones at once; the text encoder
+and the first predictor stay as they are. So a planner can ask where a sentence leads without imagining the way.
 """
 
 from __future__ import annotations
@@ -26,11 +29,19 @@ from textocvp.data.cache import cached_slots
 from textocvp.data.episodes import words_of
 from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.layers import sinusoids
-from textocvp.model import TextOCVP
+from textocvp.model import TextOCVP, check_parts
+from textocvp.predictors import build_predictor
+from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import WordBatch
 from textocvp.text.words import WordsConfig
-from textocvp.training.evaluate_predictor import HeldOut, InstructionFollowing, SlotErrors
+from textocvp.training.evaluate_predictor import (
+    HeldOut,
+    InstructionFollowing,
+    Outcomes,
+    SlotErrors,
+    measure_outcomes,
+)
 from textocvp.training.losses import drawn_loss, moving_weights, slot_loss
 from textocvp.training.run import (
     Run,
@@ -53,6 +64,8 @@ class PredictorTraining(TrainingSettings):
     finetune: bool = False
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
     `--set predictor.window=40` they learn longer rollouts."""
+    outcome: bool = False
+    """Train the predictor of whole sentences, beside the one that the checkpoint `parser` has."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
     steps: int = 1100
@@ -80,9 +93,9 @@ class PredictorTraining(TrainingSettings):
 class PredictorStage(nn.Module):
     """What stage 2 trains, as one module, so that several processes can share its gradients."""
 
-    def __init__(self, model: TextOCVP) -> None:
+    def __init__(self, model: TextOCVP, predictor: SlotPredictor | None = None) -> None:
         super().__init__()
-        self.text, self.predictor = model.text, model.predictor
+        self.text, self.predictor = model.text, predictor or model.predictor
         if not self.predictor.uses_text:  # several processes would wait for gradients that never come
             self.text.requires_grad_(False)
 
@@ -122,7 +135,7 @@ def schedule(
     return (frames - horizon if causal else int(rng.integers(1, frames - horizon + 1))), horizon - 1
 
 
-def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
+def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcomes | None:
     """Run or continue stage 2; writes `out`/checkpoint, a whole model.
 
     Returns:
@@ -139,15 +152,18 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
     trained = TextOCVP.from_pretrained(str(args.parser))
     with open_data(args, trained.config.parser.image_size, "parser.image_size") as (episodes, held_out):
         model = assemble(args, trained, episodes.instructions, episodes.vocabulary).to(accelerator.device)
-        layout, causal = model.config.parser.layout, model.config.predictor.causal
+        predictor = model.outcome if args.outcome else model.predictor
+        assert predictor is not None
+        layout, causal = model.config.parser.layout, predictor.config.causal
         share = (accelerator.process_index, accelerator.num_processes)
         slots = cached_slots(model, episodes, args.out / "slots-train", *share)
         val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
         accelerator.wait_for_everyone()
         # One frame more than the past, so that every time code gets trained.
         longest = int(slots.lengths.max())
-        frames = model.config.predictor.window + 1 if causal else longest
-        if longest > frames and accelerator.is_main_process:
+        frames = predictor.config.window + 1 if causal else longest
+        frames, every = (2, longest - 1) if args.outcome else (frames, 1)
+        if longest > every * (frames - 1) + 1 and accelerator.is_main_process:
             warnings.warn(
                 f"{(slots.lengths > frames).mean():.0%} of the episodes of {args.data} are longer than the "
                 f"predictor's window, and their ends are cut off: nothing is learned after frame {frames}, the "
@@ -155,17 +171,17 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
                 UserWarning,
                 stacklevel=2,
             )
-        batches = SlotBatches(slots, layout, model.text, frames)
-        std_C = model.predictor.content_std_C if model.predictor.standardized else None
+        batches = SlotBatches(slots, layout, model.text, frames, every)
+        std_C = predictor.content_std_C if predictor.standardized else None
         if (
             std_C is not None and not args.finetune
         ):  # which keeps the units in which the predictor was trained
             mean_C, deviation_C = batches.content_statistics()
-            model.predictor.content_mean_C.copy_(mean_C)
+            predictor.content_mean_C.copy_(mean_C)
             std_C.copy_(deviation_C)
-        held = HeldOut.of(held_out, val_slots, layout, frames)
-        measure = partial(held.measure, model)
-        run = Run(args, accelerator, PredictorStage(model))
+        held = HeldOut.of(held_out, val_slots, layout, frames, every)
+        measure = partial(measure_outcomes, model, held) if args.outcome else partial(held.measure, model)
+        run = Run(args, accelerator, PredictorStage(model, predictor))
 
         for step in run.steps("predictor"):
             # Every process draws the whole batch, and then computes its rows of it.
@@ -190,7 +206,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
                 loss = slot_loss(predicted_BSKD, target_BSKD, weights, layout, std_C)
                 total = loss.total(args.scale_weight, args.content_weight)
                 if args.image_weight > 0:
-                    times_BF = first + drawn_BF[rows]
+                    times_BF = every * (first + drawn_BF[rows])
                     true_BF3HW = true_frames(
                         episodes, batch.episodes_B[rows], times_BF, batch.channels_B3[rows]
                     )
@@ -199,7 +215,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | None:
                 run.backward(total, vars(loss))
             run.update(step, {"horizon": 1.0 + imagined})
             run.evaluate(step, measure)
-        metrics = run.finish(model.save_pretrained, measure, held.file)
+        metrics = run.finish(model.save_pretrained, measure, "outcomes.json" if args.outcome else held.file)
     close_run(accelerator)
     return metrics
 
@@ -219,7 +235,9 @@ def assemble(
             longer window).
     """
     config = trained.config
-    if args.finetune:
+    if args.outcome:
+        model = with_outcome(args, trained)
+    elif args.finetune:
         if args.preset is not None:
             raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
         if config.stage == "parser":
@@ -252,6 +270,36 @@ def assemble(
     for part in (model.parser, model.renderer):
         part.requires_grad_(False).eval()
     return model
+
+
+def with_outcome(args: PredictorTraining, trained: TextOCVP) -> TextOCVP:
+    """The model with a predictor of whole sentences to train, and all else frozen; errors as `assemble`.
+
+    The new predictor is built as the first one, but for its window, which is one frame, and for `--set outcome.*`.
+    """
+    config = trained.config
+    if config.stage == "parser" or args.preset is not None:
+        raise SettingsError(
+            f"--outcome goes with a trained predictor, which {args.parser} must have, and no preset"
+        )
+    if args.finetune and (config.outcome is None or args.set):
+        raise SettingsError(
+            "--finetune --outcome goes on with an outcome that is there, as it is: leave out set"
+        )
+    for setting in args.set:
+        if not setting.startswith("outcome."):
+            raise SettingsError(f"{setting!r}: with --outcome set outcome.* only")
+    if not args.finetune:
+        with allowed_settings():
+            config = with_settings(replace(config, outcome=replace(config.predictor, window=1)), args.set)
+            check_parts(config)
+            assert config.outcome is not None
+            trained.config = config
+            trained.outcome = build_predictor(config.outcome, config.parser.layout, config.text.dim)
+    trained.requires_grad_(False).eval()
+    assert trained.outcome is not None
+    trained.outcome.requires_grad_(True).train()
+    return trained
 
 
 def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
