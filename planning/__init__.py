@@ -16,7 +16,7 @@ Nothing here reads the simulator's state, except `SegmentationGrounder` and `gro
 """
 
 from planning.camera import PinholeCamera
-from planning.controller import Controller, PickAndPlace
+from planning.controller import Controller, LiteralController, PickAndPlace
 from planning.grounding import (
     AppearanceGrounder,
     Grounder,
@@ -27,9 +27,18 @@ from planning.grounding import (
     ground,
     ground_by_segmentation,
 )
-from planning.language import Goal, Instruction, Thing
+from planning.language import AnyGoal, Goal, Instruction, PictureGoal, Thing
 from planning.loop import Attempt, EpisodeResult, run_episode
-from planning.planners import BeamPlanner, Candidate, Imagines, Plan, Planner, RandomPlanner, watched_frames
+from planning.planners import (
+    BeamPlanner,
+    Candidate,
+    Imagines,
+    Plan,
+    Planner,
+    RandomPlanner,
+    observe,
+    watched_frames,
+)
 from planning.relations import RELATIONS, THRESHOLDS, Relation, Thresholds
 from planning.scores import (
     CarryScore,
@@ -42,25 +51,41 @@ from planning.scores import (
     measure_rollout,
     unmet,
 )
+from planning.search import (
+    AnySentencePlanner,
+    BelievingPlanner,
+    Foresees,
+    LiteralPlanner,
+    SearchPlanner,
+    places,
+    seen_supports,
+)
 
 __all__ = [
     "RELATIONS",
     "THRESHOLDS",
+    "AnyGoal",
+    "AnySentencePlanner",
     "AppearanceGrounder",
     "Attempt",
     "BeamPlanner",
+    "BelievingPlanner",
     "Candidate",
     "CarryScore",
     "Controller",
     "EpisodeResult",
+    "Foresees",
     "Goal",
     "Grounder",
     "Grounding",
     "GroundingError",
     "Imagines",
     "Instruction",
+    "LiteralController",
+    "LiteralPlanner",
     "Palette",
     "PickAndPlace",
+    "PictureGoal",
     "PinholeCamera",
     "PlacementScore",
     "Plan",
@@ -68,6 +93,7 @@ __all__ = [
     "RandomPlanner",
     "Relation",
     "Score",
+    "SearchPlanner",
     "SegmentationGrounder",
     "SuccessCriterion",
     "Thing",
@@ -78,7 +104,10 @@ __all__ = [
     "ground_by_segmentation",
     "measure",
     "measure_rollout",
+    "observe",
+    "places",
     "run_episode",
+    "seen_supports",
     "unmet",
     "watched_frames",
 ]

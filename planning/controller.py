@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
 from planning.grounding import Grounding
-from planning.language import Instruction
+from planning.language import Instruction, Thing
 from planning.masks import frame_masks
 from planning.relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
+
+# Metres above the table of the point that the slot of a thing on the table is centred on: the middle of a block, and of
+# what is seen of a bowl.
+RESTING_HEIGHTS = {"block": 0.029, "bowl": 0.026}
 
 
 @dataclass(frozen=True)
@@ -36,9 +40,9 @@ class Controller:
     """Reads pick and place points off a rollout: where the thing's slot starts, and where it ends."""
 
     camera: PinholeCamera
-    # Metres above the table of the point that the slot of a thing is centred on: the middle of a block. With it, on the
-    # true masks of 100 val scenes, picks are at most 2.6 mm off and places 3.3 mm (`experiments/calibrate.py`).
-    pick_height: float = 0.029
+    # With it, on the true masks of 100 val scenes, picks are at most 2.6 mm off and places 3.3 mm
+    # (`experiments/calibrate.py`).
+    pick_height: float = RESTING_HEIGHTS["block"]
 
     def act(self, rollout: Rollout, grounding: Grounding, instruction: Instruction) -> PickAndPlace:
         """The action that makes a rollout (B = 1) of this instruction real.
@@ -52,6 +56,36 @@ class Controller:
         pick = self.camera.unproject_to_plane(start, self.pick_height)
         place = self.camera.unproject_to_plane(end, RELATIONS[instruction.relation].place_height)
         return PickAndPlace((float(pick[0]), float(pick[1])), (float(place[0]), float(place[1])))
+
+
+@dataclass(frozen=True)
+class LiteralController:
+    """Picks where the named thing is seen and places over where the target is seen, whatever was imagined."""
+
+    camera: PinholeCamera
+
+    def act(self, rollout: Rollout, grounding: Grounding, instruction: Instruction) -> PickAndPlace:
+        """The action that says what the instruction says; errors as `Controller.act`."""
+        points = [self._point(rollout, grounding, one) for one in instruction.things]
+        return PickAndPlace(*points)
+
+    def _point(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> tuple[float, float]:
+        center = slot_center(rollout, grounding.slots_of(thing), 0)
+        x, y, _ = self.camera.unproject_to_plane(center, self._height(rollout, grounding, thing))
+        return float(x), float(y)
+
+    def _height(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> float:
+        """Metres above the table of the point that a thing's slot is centred on, by what it is seen to stand on."""
+        center = slot_center(rollout, grounding.slots_of(thing), 0)
+        for relation in RELATIONS.values():
+            if thing.kind != relation.kinds[0]:
+                continue
+            for other in grounding.of_kind(relation.kinds[1]):
+                off = center - slot_center(rollout, grounding.slots_of(other), 0) - relation.offset_px
+                if other != thing and np.linalg.norm(off) <= relation.within_px:
+                    below = self._height(rollout, grounding, other)
+                    return below + relation.place_height - RESTING_HEIGHTS[other.kind]
+        return RESTING_HEIGHTS[thing.kind]
 
 
 def slot_center(rollout: Rollout, slots: Sequence[int], frame: int) -> NDArray[np.float64]:

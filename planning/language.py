@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from planning.relations import RELATIONS
 
 
@@ -91,9 +94,26 @@ class Goal:
         return cls(_parse(text))
 
     @property
+    def steps(self) -> int:
+        """How many sentences it takes, if each comes true."""
+        return len(self.instructions)
+
+    @property
     def things(self) -> tuple[Thing, ...]:
         """Everything that the goal names."""
         return tuple(dict.fromkeys(thing for one in self.instructions for thing in one.things))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureGoal:
+    """A picture of how all shall be, taken by the camera that the robot sees with."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    things: tuple[Thing, ...] = ()  # what language says of it: nothing
+    steps: int = 1  # that count for the attempts at it
+
+
+AnyGoal = Goal | PictureGoal
 
 
 def _parse(text: str) -> tuple[Instruction, ...]:

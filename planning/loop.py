@@ -11,11 +11,10 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
-from planning.controller import Controller, PickAndPlace
+from planning.controller import Controller, LiteralController, PickAndPlace
 from planning.grounding import AppearanceGrounder, Grounder, GroundingError
-from planning.language import Goal, Instruction
-from planning.planners import Plan, Planner, observe
-from planning.scores import unmet
+from planning.language import AnyGoal, Goal, Instruction
+from planning.planners import Plan, Planner
 
 if TYPE_CHECKING:
     import gymnasium
@@ -61,10 +60,10 @@ class EpisodeResult:
 def run_episode(
     env: gymnasium.Env[Any, Any],
     planner: Planner,
-    goal: Goal | None = None,
+    goal: AnyGoal | None = None,
     *,
     ground: Callable[[Mapping[str, Any]], Grounder] = AppearanceGrounder.from_info,
-    controller: Callable[[PinholeCamera], Controller] = Controller,
+    controller: Callable[[PinholeCamera], Controller | LiteralController] = Controller,
     seed: int | None = None,
     options: Mapping[str, Any] | None = None,
     max_attempts: int = 3,
@@ -102,7 +101,7 @@ def run_episode(
     attempts: list[Attempt] = []
     queue: list[tuple[Instruction, Rollout]] = []
     reached, gained, error = False, 0.0, None
-    for _ in range(max_attempts * len(goal.instructions)):
+    for _ in range(max_attempts * goal.steps):
         try:
             if not queue:
                 plan = planner.plan(rgb, goal, ground(info))
@@ -117,7 +116,7 @@ def run_episode(
         observation, reward, _, truncated, info = env.step(within_reach)
         rgb, gained = observation["rgb"], gained + float(reward)
         frames.append(np.asarray(info["frames"]) if "frames" in info else rgb[None])
-        reached = _looks_reached(planner, rgb, goal, ground(info))
+        reached = planner.reached(rgb, goal, ground(info))
         attempts.append(Attempt(seen, plan, instruction, rollout, action, reached))
         if replan:
             queue = []
@@ -125,10 +124,3 @@ def run_episode(
             break
     success = bool(info["is_success"])
     return EpisodeResult(success, gained, reached, tuple(attempts), error, np.concatenate(frames))
-
-
-def _looks_reached(planner: Planner, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> bool:
-    try:
-        return not unmet(*observe(planner.world_model, rgb, goal, grounder), goal)
-    except GroundingError:  # what cannot be seen is not known to be reached
-        return False

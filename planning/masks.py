@@ -39,11 +39,6 @@ def centroids(masks_NHW: Tensor) -> Tensor:
     return torch.stack([x_N, y_N], dim=-1)
 
 
-def centroid_distance(a_NHW: Tensor, b_NHW: Tensor) -> Tensor:
-    """Distance (...) between the centroids of two bool masks (..., H, W), in pixels; inf if one is empty."""
-    return (centroids(a_NHW) - centroids(b_NHW)).norm(dim=-1).nan_to_num(nan=UNSEEN)
-
-
 def contact_distance(a_NHW: Tensor, b_NHW: Tensor) -> Tensor:
     """Smallest distance (...) between the pixels of two bool masks (..., H, W), in pixels between pixel centres.
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from planning.grounding import Grounder, Grounding, GroundingError
-from planning.language import Goal, Instruction
+from planning.language import AnyGoal, Goal, Instruction
 from planning.masks import frame_masks
 from planning.relations import RELATIONS
 from planning.scores import (
@@ -77,14 +77,28 @@ class Plan:
 class Planner(Protocol):
     """Chooses what to do, given a picture and a goal."""
 
-    world_model: Imagines
-
-    def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
-        """A plan for the goal from one observation (H, W, 3).
+    def plan(self, rgb: NDArray[np.uint8], goal: Any, grounder: Grounder) -> Plan:
+        """A plan for the goal, a `Goal` or what else the planner takes, from one observation (H, W, 3).
 
         Raises:
             GroundingError: if what the plan is made of cannot be found in the picture.
         """
+
+    def reached(self, rgb: NDArray[np.uint8], goal: Any, grounder: Grounder) -> bool:
+        """Whether the goal is seen to be reached; what cannot be seen is not known to be."""
+
+
+class _LooksAtMasks:
+    """Takes a goal for reached when the masks of the picture show it."""
+
+    world_model: Imagines
+
+    def reached(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> bool:
+        """See `Planner.reached`."""
+        try:
+            return not unmet(*observe(self.world_model, rgb, goal, grounder), goal)
+        except GroundingError:
+            return False
 
 
 def watched_frames(length: int, settle: int, stride: int) -> tuple[int, ...]:
@@ -101,7 +115,7 @@ class _Branch:
 
 
 @dataclass
-class BeamPlanner:
+class BeamPlanner(_LooksAtMasks):
     """Beam search over sequences of instructions, which move each thing at most once.
 
     Each step is imagined from where the last imagined one ended; all candidates of a step are one batch. A sequence of
@@ -186,7 +200,7 @@ class BeamPlanner:
 
 
 @dataclass
-class RandomPlanner:
+class RandomPlanner(_LooksAtMasks):
     """The control row: random instructions, imagined only to be carried out. See `BeamPlanner` for the other options.
 
     A plan of depth 1 is any instruction of the scene. In a longer one no thing and no target comes twice.
@@ -229,7 +243,7 @@ class RandomPlanner:
 
 
 def observe(
-    world_model: Imagines, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder, seed: int = 0
+    world_model: Imagines, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder, seed: int = 0
 ) -> tuple[Rollout, Grounding]:
     """A picture (H, W, 3), parsed and grounded; the goal's sentence says of what kind its things are."""
     parsed = world_model.parse(rgb[None], seed=seed)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.masks import UNSEEN, Bools, center_inside, centroid_distance, centroids
+from planning.masks import UNSEEN, Bools, center_inside, centroids
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,16 @@ class Relation:
 
     template: str  # what asks for it in a sentence; `{thing}` and `{target}` stand for "red block" and so on
     kinds: tuple[str, str]  # of the thing and of its target
-    # How far bool masks (..., H, W) of thing and target are from it: (...) in pixels, inf where one is empty.
-    distance: Callable[[Tensor, Tensor], Tensor]
-    within_px: float  # an imagined rollout fulfils it while that distance is at most this
+    offset_px: tuple[float, float]  # from the target's centroid to the thing's then, x right and y down
+    within_px: float  # an imagined rollout fulfils it while `distance` is at most this
     # Whether bool masks (H, W) of thing and target show it, in the frame that is seen.
     holds: Callable[[Bools, Bools], bool]
     place_height: float  # metres above the table of the point that the thing's slot is centred on then
+
+    def distance(self, thing_NHW: Tensor, target_NHW: Tensor) -> Tensor:
+        """How far bool masks (..., H, W) are from it: (...) in pixels; inf where a mask is empty."""
+        off_N2 = centroids(thing_NHW) - centroids(target_NHW)
+        return (off_N2 - off_N2.new_tensor(self.offset_px)).norm(dim=-1).nan_to_num(nan=UNSEEN)
 
     @property
     def pattern(self) -> re.Pattern[str]:
@@ -64,20 +68,16 @@ STACK_PX = 6.9  # rows by which a block's pixels are higher in the picture than 
 ON_PX = 4.0
 
 
-def off_stack(thing_NHW: Tensor, target_NHW: Tensor) -> Tensor:
-    """How far a block's centroid is from where it is on a target: (...) in pixels; inf where a mask is empty.
-
-    Both are bool masks (..., H, W).
-    """
-    offset_N2 = centroids(thing_NHW) - centroids(target_NHW)
-    return (offset_N2 + offset_N2.new_tensor([0.0, STACK_PX])).norm(dim=-1).nan_to_num(nan=UNSEEN)
+def _on(thing_HW: Bools, target_HW: Bools) -> bool:
+    on = RELATIONS["on"]
+    return bool(on.distance(torch.as_tensor(thing_HW), torch.as_tensor(target_HW)) <= on.within_px)
 
 
 RELATIONS: dict[str, Relation] = {
     "in": Relation(
         template="the {thing} in the {target}",
         kinds=("block", "bowl"),
-        distance=centroid_distance,
+        offset_px=(0.0, 0.0),
         # Calibrated as above: a block's centroid ended at most 1.0 px from its own bowl's, and at least 17.7 px from
         # any other's. 4 px are 31 mm on the table: as far as a block can be off the centre and lie within the rim.
         within_px=4.0,
@@ -88,9 +88,9 @@ RELATIONS: dict[str, Relation] = {
     "on": Relation(
         template="the {thing} on the {target}",
         kinds=("block", "block"),
-        distance=off_stack,
+        offset_px=(0.0, -STACK_PX),
         within_px=ON_PX,
-        holds=lambda thing, target: bool(off_stack(torch.as_tensor(thing), torch.as_tensor(target)) <= ON_PX),
+        holds=_on,
         place_height=0.087,
     ),
 }

@@ -229,6 +229,24 @@ class Rollout:
         kept = ({0: kind[end]} if end in kind else {} for kind in (decoded.masks, decoded.frames))
         return replace(self, slots=self.slots[:, -1:], attention=None, _decoded=_Decoded(*kept))
 
+    def moved(self, positions_BK2: Tensor, texts: Sequence[str]) -> Rollout:
+        """Rollouts of two frames: the last one of this (B = 1), and its slots at other places (B, K, 2), in pixels.
+
+        Raises:
+            ValueError: if slots carry no place that could be changed.
+        """
+        slots_BKD = self.slots[:, -1].expand(len(positions_BK2), -1, -1)
+        state = SlotState.split(slots_BKD, self.layout)
+        ends_BKD = replace(state, position=2 * positions_BK2 / self._pixels_per_side - 1).join()
+        return replace(
+            self,
+            slots=torch.stack([slots_BKD, ends_BKD], dim=1),
+            texts=tuple(texts),
+            attention=None,
+            seen=None if self.seen is None else self.seen * len(positions_BK2),
+            _decoded=_Decoded(),
+        )
+
     def save(self, path: str | Path, *, beside: np.ndarray | None = None, fps: int = 6) -> Path:
         """Draw frames and masks, in one stable colour for each slot, into a file; returns its path.
 

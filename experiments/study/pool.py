@@ -37,7 +37,7 @@ class Worker:
 
     def environment(self, scene: StudyScene) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""
-        key = scene.steps, scene.look, scene.image_size
+        key = scene.env_id, scene.steps, scene.look, scene.image_size
         if key not in self._environments:
             self._environments[key] = scene.make()
         return self._environments[key]

@@ -29,14 +29,15 @@ class StudyScene:
     steps: int = 1  # pairs of the goal
     look: str = "simple"  # what it looks like: `scene` of the environment
     image_size: int = 64
+    env_id: str = ""  # by default the one for goals of so many steps
 
     def make(self) -> gym.Env[Any, Any]:
         """The environment it is played in, which records the frames of its motions."""
         options: dict[str, Any] = {"scene": self.look, "image_size": self.image_size}
-        if self.steps == 1:
-            return gym.make("PutBlockInBowl-v0", control="primitive", record_frames=True, **options)
-        options["n_pairs"] = self.steps
-        return gym.make("PutBlocksInBowls-v0", control="primitive", record_frames=True, **options)
+        if self.steps > 1:
+            options["n_pairs"] = self.steps
+        name = self.env_id or ("PutBlockInBowl-v0" if self.steps == 1 else "PutBlocksInBowls-v0")
+        return gym.make(name, control="primitive", record_frames=True, **options)
 
 
 def study_scenes(

@@ -18,13 +18,13 @@ from planning import (
     measure_rollout,
     unmet,
 )
-from planning.masks import contact_distance
 from tests.planning.conftest import put_in, thing
 from tests.planning.oracle import OracleWorldModel
 
 RGB = np.zeros((64, 64, 3), np.uint8)
 RED, GREEN, BLUE = Thing("red", "block"), Thing("green", "block"), Thing("blue", "bowl")
 OFFSET = (0.0, 0.07)  # metres: two blocks side by side
+OFFSET_PX = (9.5, 0.0)  # the same in the picture
 
 
 def touching(thing_HW: np.ndarray, target_HW: np.ndarray) -> bool:
@@ -37,7 +37,7 @@ def beside(monkeypatch: pytest.MonkeyPatch) -> Instruction:
     relation = Relation(
         template="the {thing} beside the {target}",
         kinds=("block", "block"),
-        distance=contact_distance,
+        offset_px=OFFSET_PX,
         within_px=3.0,
         holds=touching,
         place_height=0.029,
@@ -84,7 +84,7 @@ def test_a_new_relation_is_planned_scored_and_carried_out(
     slots = [list(plan.grounding.slots_of(thing)) for thing in (RED, GREEN)]
     winner_HW = plan.rollout.masks[0, -1].argmax(0)
     red, green = (sum(winner_HW == slot for slot in its).bool() for its in slots)
-    assert trace.distance_Bt[0, -1] == contact_distance(red, green)
+    assert trace.distance_Bt[0, -1] == RELATIONS["beside"].distance(red, green)
 
     action = Controller(camera).act(plan.rollout, plan.grounding, beside)
     np.testing.assert_allclose(action.place, (0.62, 0.10 + OFFSET[1]), atol=0.01)

@@ -15,7 +15,8 @@ from planning import (
     measure,
     measure_rollout,
 )
-from planning.masks import centroid_distance, contact_distance
+from planning.masks import contact_distance
+from planning.relations import RELATIONS
 from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 
@@ -42,14 +43,14 @@ def test_unseen_things_are_infinitely_far() -> None:
     some, none = torch.ones(1, 1, 8, 8, dtype=torch.bool), torch.zeros(1, 1, 8, 8, dtype=torch.bool)
     for arm, block in ((some, none), (none, some), (none, none)):
         assert torch.isinf(contact_distance(arm, block)).all()
-        assert torch.isinf(centroid_distance(arm, block)).all()
+        assert torch.isinf(RELATIONS["in"].distance(arm, block)).all()
 
 
 def test_centroid_distance_is_between_centroids() -> None:
     block, bowl = torch.zeros(1, 1, 16, 16, dtype=torch.bool), torch.zeros(1, 1, 16, 16, dtype=torch.bool)
     block[..., 2:4, 2:4] = True
     bowl[..., 5:9, 6:10] = True
-    assert centroid_distance(block, bowl).item() == pytest.approx(np.hypot(5, 4))
+    assert RELATIONS["in"].distance(block, bowl).item() == pytest.approx(np.hypot(5, 4))
 
 
 def test_contact_counts_the_longest_run() -> None:

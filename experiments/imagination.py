@@ -1,0 +1,479 @@
+"""Imagination: does it help a robot to foresee what a sentence leads to, where that is not what the sentence says?
+
+    python experiments/imagination.py              # default: about 25 minutes on 2 cores
+    python experiments/imagination.py --quick      # a first look
+
+Goals in `RearrangeBlocks-v0`: blocks in bowls that are taken, blocks that carry another, blocks that are to change
+places, towers, and pictures of other arrangements. Ours searches sequences of sentences, and asks the world model where
+each leads. Beside it: the goal's own sentences without any imagination; the same search by a robot that believes every
+sentence; any sentence at random; and a search in the simulator itself. The simulator alone judges, strictly: what
+carries what, everything at rest, the gripper back home. Writes `results.json`, `timings.json`, `report.html`, plots and
+clips into `--out`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, cast
+
+import numpy as np
+
+from envs import Expert
+from envs.splits import SPLITS
+from envs.tabletop import TabletopEnv
+from envs.tasks.rearrange import FAMILIES, Rearrange
+from experiments.report.gif import gif
+from experiments.report.page import CardSpec, Clip, Clips, Section
+from experiments.report.plots import plot_table
+from experiments.report.results import Results
+from experiments.report.rows import Key, Row, mean_row, rate_row
+from experiments.report.tables import Column, Line, TableSpec, columns
+from experiments.study.clips import tone
+from experiments.study.pool import Unit, Worker
+from experiments.study.predictions import to_uint8
+from experiments.study.run import Found, Part, Run, Study, UsageError, start
+from experiments.study.scenes import SCENES_PER_SEED, StudyScene
+from planning import (
+    AnyGoal,
+    AnySentencePlanner,
+    AppearanceGrounder,
+    BelievingPlanner,
+    Foresees,
+    Goal,
+    LiteralController,
+    LiteralPlanner,
+    PictureGoal,
+    Planner,
+    SearchPlanner,
+    SegmentationGrounder,
+    Thing,
+    observe,
+    places,
+    run_episode,
+    seen_supports,
+)
+from textocvp import WorldModel
+
+FIRST, APART = 5_000, 500  # seeds of the test split that no other study uses: so many for each family
+OUTCOMES = "outcomes"  # the part of sentences whose ends are foreseen
+FIRST_OUTCOME = 8_500
+SENTENCES = 6  # that are played in a row in each of its scenes
+ATTEMPTS = {"plain": 2, "occupied": 4, "covered": 4, "swap": 6, "tower": 4, "picture": 8}
+"""Pick-and-places at most: twice the fewest sentences that the family's goals need."""
+SUCCESS, RIGHT = "closed_loop_success", "outcome_right"
+CASES = ("plain", "occupied", "covered", "both")
+"""What a sentence finds: nothing on the thing and nothing at the target; something at the target, on the thing, or at
+both."""
+BUDGETS = (15, 60, 250, 1000)
+MakeSearch = Callable[[Foresees, int], Planner]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Searcher(Line):
+    """A line of the tables, and the planner behind it; None for the scripted search in the simulator."""
+
+    plan: MakeSearch | None = None
+    privileged: bool = False  # whether the simulator's segmentation says which slot is what
+    pictures: bool = True  # whether it takes pictures as goals
+
+
+def _with_budget(budget: int) -> MakeSearch:
+    return lambda model, seed: SearchPlanner(model, budget=budget)
+
+
+OURS = "ours"
+LINES: dict[str, Searcher] = {
+    line.key: line
+    for line in (
+        Searcher(key=OURS, hue=0, note="searches what it foresees", plan=_with_budget(BUDGETS[-1])),
+        Searcher(key="no imagination", kind="control", hue=2, pictures=False,
+                 note="carries out the goal's own sentences, in order",
+                 plan=lambda model, seed: LiteralPlanner(model)),
+        Searcher(key="believes", kind="control", hue=4, note="the same search; every sentence comes true as it says",
+                 plan=lambda model, seed: BelievingPlanner(model)),
+        Searcher(key="random", kind="control", hue=5, note="any sentence that the scene allows",
+                 plan=lambda model, seed: AnySentencePlanner(model, rng=np.random.default_rng(seed))),
+        Searcher(key="ours, privileged", kind="ceiling", hue=3, privileged=True,
+                 note="the same, but slots are named by the simulator's segmentation",
+                 plan=_with_budget(BUDGETS[-1])),
+        Searcher(key="simulator", kind="ceiling", hue=1, note="searches in a copy of the simulator, knows every pose"),
+    )
+}  # fmt: skip
+"""Who is measured in every family."""
+CURVE = {
+    f"budget {budget}": Searcher(key=f"budget {budget}", hue=0, note="ours", plan=_with_budget(budget))
+    for budget in BUDGETS[:-1]
+}
+CURVE_FAMILIES = ("swap", "picture")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured."""
+
+    scenes: int  # of each family
+    outcomes: int  # scenes in which sentences are foreseen
+    clips: int  # episodes that are shown
+
+
+QUICK, DEFAULT = Sizes(4, 12, 4), Sizes(60, 100, 12)
+
+
+# --- units of work ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Played:
+    """What came of an episode."""
+
+    episode: Episode
+    goal: str
+    success: bool  # the simulator's verdict after the last action
+    believes_reached: bool | None
+    said: tuple[str, ...]
+    seconds: tuple[float, ...]  # of each plan
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A unit of work: one searcher, one scene."""
+
+    method: str
+    scene: StudyScene
+    seed: int
+
+    @property
+    def family(self) -> str:
+        """Of the scene."""
+        return str(dict(self.scene.options)["family"])
+
+    def run(self, worker: Worker) -> Played:
+        """Play it."""
+        env, searcher = worker.environment(self.scene), {**LINES, **CURVE}[self.method]
+        observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
+        if searcher.plan is None:
+            said = []
+            expert = Expert(env)
+            for pair in expert.search()[: ATTEMPTS[self.family]]:
+                base = cast(TabletopEnv, env.unwrapped)
+                said.append(base.task.scene(base.scene.objects, (pair,)).instruction)
+                info = env.step(expert.primitive(pair))[4]
+            return Played(self, info["instruction"], bool(info["is_success"]), None, tuple(said), ())
+        result = self.pursue(worker, observation, info)
+        said = [attempt.instruction.text for attempt in result.attempts]
+        seconds = tuple(attempt.plan.seconds for attempt in result.attempts)
+        return Played(
+            self,
+            info["instruction"],
+            result.success,
+            result.believes_reached,
+            tuple(said),
+            seconds,
+            result.error,
+        )
+
+    def pursue(self, worker: Worker, observation: Mapping[str, Any], info: Mapping[str, Any]) -> Any:
+        """Plan and act; see `run_episode`."""
+        searcher = {**LINES, **CURVE}[self.method]
+        assert searcher.plan is not None
+        goal = goal_of(observation, info)
+        return run_episode(
+            worker.environment(self.scene),
+            searcher.plan(cast(Foresees, worker.world_model), self.scene.seed),
+            goal,
+            ground=(SegmentationGrounder if searcher.privileged else AppearanceGrounder).from_info,
+            controller=LiteralController,
+            seed=self.scene.seed,
+            options=dict(self.scene.options),
+            max_attempts=-(-ATTEMPTS[self.family] // goal.steps),
+        )
+
+
+def goal_of(observation: Mapping[str, Any], info: Mapping[str, Any]) -> AnyGoal:
+    """What the environment asks for."""
+    if observation["goal_rgb"].any():
+        return PictureGoal(observation["goal_rgb"])
+    return Goal.parse(info["instruction"])
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """What was foreseen of one scene: for each case, of each sentence whether it was right."""
+
+    right: Mapping[str, Sequence[bool]]
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """A unit of work: random sentences, one after another, each foreseen before it is played."""
+
+    scene: StudyScene
+    seed: int
+
+    def run(self, worker: Worker) -> Foreseen:
+        """Play and compare: right is what ends with every block carried by what it was foreseen to be carried by."""
+        env = worker.environment(self.scene)
+        observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
+        base, rng = cast(TabletopEnv, env.unwrapped), np.random.default_rng([self.seed, self.scene.seed])
+        model, task = cast(Foresees, worker.world_model), cast(Rearrange, base.task)
+        right: dict[str, list[bool]] = {case: [] for case in CASES}
+        for _ in range(SENTENCES):
+            pairs = task.sentences(base.scene.objects, "seen")
+            pair = pairs[int(rng.integers(len(pairs)))]
+            text = task.scene(base.scene.objects, (pair,)).instruction
+            before, grounder = info["supports"], SegmentationGrounder.from_info(info)
+            parsed, grounding = observe(model, observation["rgb"], PictureGoal(observation["rgb"]), grounder)
+            things = sorted(grounding.things)
+            foreseen = seen_supports(places(model.outcome(parsed, [text]), grounding, things), things)[0]
+            observation, *_, info = env.step(Expert(env).primitive(pair))
+            named = [Thing(item["color"], item["kind"]) for item in info["objects"]]
+            carriers = [None if at < 0 else named[at] for at in info["supports"]]
+            true = {one: at for one, at in zip(named, carriers, strict=True) if one.kind == "block"}
+            covered = pair.thing in before
+            taken = any(at == pair.target and one != pair.thing for one, at in enumerate(before))
+            case = CASES[2 * covered + taken]
+            right[case].append(foreseen == true)
+        return Foreseen(right)
+
+
+@dataclass(frozen=True)
+class ConsequenceClip:
+    """A unit of work: the film of the obvious sentence as imagined, beside what ours does and what the camera sees."""
+
+    played: Played
+    rank: int
+
+    def run(self, worker: Worker) -> Clip:
+        """Play it once more, and imagine both films."""
+        episode = self.played.episode
+        env = worker.environment(episode.scene)
+        observation, info = env.reset(seed=episode.scene.seed, options=dict(episode.scene.options))
+        goal, model = goal_of(observation, info), worker.world_model
+        horizon = min(24, model.longest_horizon or 24)
+        films = []
+        if isinstance(goal, Goal):
+            obvious = model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon)
+            films.append(to_uint8(obvious.frames[0]))
+        else:
+            films.append(goal.rgb[None])
+        result = episode.pursue(worker, observation, info)
+        taken = [
+            model.rollout(attempt.rgb, attempt.instruction.text, horizon=horizon)
+            for attempt in result.attempts
+        ]
+        films += [
+            np.concatenate([to_uint8(one.frames[0]) for one in taken] or [result.frames[:1]]),
+            result.frames,
+        ]
+        said = "; ".join(text.removeprefix("put ") for text in self.played.said) or "nothing"
+        return Clip(
+            name=f"imagination-{self.rank}.gif",
+            gif=gif([[film[::2] if len(film) > 1 else film for film in films]], seconds_a_frame=0.2),
+            panels=(
+                "the goal, said at once" if isinstance(goal, Goal) else "the goal",
+                "the plan",
+                "what happened",
+            ),
+            title=self.played.goal,
+            caption=f"{episode.family}, seed {episode.scene.seed}; said: {said}",
+            badge="success" if result.success else "failure",
+            tone=tone(result.success),
+        )
+
+
+def family_scene(family: str, number: int) -> StudyScene:
+    """A scene of a family, from the seeds of the test split."""
+    split = SPLITS["test"]
+    options = (("color_split", "seen"), ("family", family), ("n_objects", 6))
+    return StudyScene("test", split.seed(number), options, env_id="RearrangeBlocks-v0")
+
+
+def units(run: Run) -> dict[str, Part]:
+    """Every episode, family by family, and the sentences that are foreseen."""
+    if cast(WorldModel, run.world_model).model.outcome is None:
+        raise UsageError(
+            f"{run.args.checkpoint} cannot foresee outcomes in one step, which this study is about"
+        )
+    parts, seed = {}, run.args.seed
+    for place, family in enumerate(FAMILIES):
+        first = SCENES_PER_SEED * seed + FIRST + APART * place
+        scenes = [family_scene(family, first + i) for i in range(run.sizes.scenes)]
+        asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
+        parts[family] = Part(
+            [
+                Episode(one.key, scene, seed)
+                for scene in scenes
+                for one in asked
+                if one.pictures or family != "picture"
+            ],
+            0.7,
+        )
+    first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
+    scenes = [family_scene(names[i % len(names)], first + i) for i in range(run.sizes.outcomes)]
+    parts[OUTCOMES] = Part([Foresight(scene, seed) for scene in scenes], 0.6)
+    return {**parts, "clips": Part(seconds=2.0, count=run.sizes.clips)}
+
+
+def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
+    """Of each family in turn, ours: first a failure, then a success."""
+    ours = [[one for one in found[family] if one.episode.method == OURS] for family in FAMILIES]
+    chosen = [sorted(its, key=lambda one: one.success)[:1] for its in ours]
+    chosen += [sorted(its, key=lambda one: -one.success)[:1] for its in ours]
+    unique = dict.fromkeys(one for its in chosen for one in its)
+    return {"clips": [ConsequenceClip(one, rank) for rank, one in enumerate(unique, 1)][: run.sizes.clips]}
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def rows(run: Run, found: Found) -> list[Row]:
+    """Success and sentences of every line and family; how often the end of a sentence was foreseen."""
+    made = []
+    for family, key in product(FAMILIES, [*LINES, *CURVE]):
+        here = [one for one in found[family] if one.episode.method == key]
+        if not here:
+            continue
+        made.append(rate_row(key, "test", family, SUCCESS, [one.success for one in here]))
+        made.append(mean_row(key, "test", family, "sentences", [len(one.said) for one in here]))
+        if key not in ("simulator", "random"):
+            beliefs = [one.believes_reached != one.success for one in here]
+            made.append(rate_row(key, "test", family, "wrong_belief", beliefs))
+        if key == OURS and family in CURVE_FAMILIES:
+            made.append(
+                rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here])
+            )
+    for case in CASES:
+        scenes = [one.right[case] for one in found[OUTCOMES] if one.right[case]]
+        if scenes:
+            made.append(rate_row(OURS, "test", case, RIGHT, [float(np.mean(its)) for its in scenes]))
+    return made
+
+
+HEADLINE: dict[str, Key] = {
+    f"{family}{'' if key == OURS else '_' + key.replace(' ', '_')}": (key, "test", family, SUCCESS)
+    for family in FAMILIES
+    for key in (OURS, "no imagination", "believes", "random", "simulator")
+    if (key, family) != ("no imagination", "picture")
+}
+HEADLINE |= {f"outcome_{case}": (OURS, "test", case, RIGHT) for case in CASES[:3]}
+
+
+# --- tables and page --------------------------------------------------------------------------------------------------
+
+COLUMNS = {family: ("test", family) for family in FAMILIES}
+GOALS = TableSpec("Goal reached", columns(SUCCESS, COLUMNS), [*LINES.values()])
+ENDS = TableSpec(
+    "The end of a sentence foreseen",
+    [Column(case, "test", case, RIGHT) for case in CASES],
+    [Line(key=OURS, note="every block carried by what it was foreseen to be carried by")],
+)
+DETAILS = TableSpec(
+    "Sentences and beliefs",
+    columns("", COLUMNS),
+    [
+        Line(key=key, kind=LINES[key].kind, metric=metric, label=f"{label}, {key}", digits=digits)
+        for key, (metric, label, digits) in product(
+            (OURS, "believes"), (("sentences", "sentences", 1), ("wrong_belief", "wrong belief", 2))
+        )
+    ],
+)
+BUDGET = TableSpec(
+    "Goal reached, by budget",
+    columns(SUCCESS, {family: COLUMNS[family] for family in CURVE_FAMILIES}),
+    [Line(key=f"budget {budget}", label=f"{budget} sentences") for budget in BUDGETS],
+)
+
+
+def seconds(found: Found) -> dict[str, dict[str, float]]:
+    """Mean seconds of a plan, line -> family -> seconds. Not in results.json, which must come out the same again."""
+    table: dict[str, dict[str, float]] = {}
+    for family, key in product(FAMILIES, LINES):
+        its = [s for one in found[family] if one.episode.method == key for s in one.seconds]
+        if its:
+            table.setdefault(key, {})[family] = round(float(np.mean(its)), 3)
+    return table
+
+
+def episodes(found: Found) -> list[dict[str, Any]]:
+    """One line an episode, from which the success rates can be computed again."""
+    return [
+        {
+            "method": one.episode.method,
+            "family": family,
+            "seed": one.episode.scene.seed,
+            "success": one.success,
+            "said": list(one.said),
+            "error": one.error,
+        }
+        for family in FAMILIES
+        for one in found[family]
+    ]
+
+
+def page(run: Run, results: Results, found: Found) -> list[Section]:
+    """The sections of the report."""
+    figures = list(results.rows)
+    return [
+        Section(
+            "Goals that need foresight",
+            "In plain scenes the sentence names the answer. In the others it does not: a block put into a taken bowl "
+            "comes to rest on the block in it, and who picks a block that carries another takes that one. Every "
+            "line may act twice as often as the fewest sentences demand, looks again after each action, and acts "
+            "alike: it picks where the named block is seen and lets go over where the target is seen.",
+            [GOALS.table(figures), plot_table("success.png", GOALS, figures, label="goal reached")],
+        ),
+        Section(
+            "What was foreseen",
+            f"{SENTENCES} random sentences in a row in scenes of all families. Plain: nothing on the block, nothing at "
+            "its target. Occupied: something is at the target. Covered: something is on the block.",
+            [ENDS.table(figures), DETAILS.table(figures)],
+        ),
+        Section(
+            "How much search it takes",
+            "The same planner, with fewer sentences to imagine for each plan.",
+            [BUDGET.table(figures)],
+        ),
+        Section(
+            "The obvious sentence, the plan, and the camera",
+            "Left: the goal's first sentence as the model imagines it, or the goal's picture. Middle: the sentences of "
+            "the plan, imagined one after another. Right: the camera.",
+            [Clips(found["clips"])] if found["clips"] else [],
+        ),
+    ]
+
+
+STUDY = Study(
+    name="imagination",
+    title="Imagination",
+    question="Does it help to foresee what a sentence leads to, where that is not what the sentence says?",
+    sizes=lambda args: QUICK if args.quick else DEFAULT,
+    units=units,
+    cases=cases,
+    rows=rows,
+    tables=(GOALS, ENDS, BUDGET),
+    page=page,
+    cards=[
+        CardSpec(label, LINES[key], Column("", "test", family, SUCCESS), text)
+        for label, key, family, text in (
+            ("Bowl taken", OURS, "occupied", "bar 0.90"),
+            ("Bowl taken, no imagination", "no imagination", "occupied", "the floor"),
+            ("Block covered", OURS, "covered", "bar 0.90"),
+            ("Block covered, believes", "believes", "covered", "the floor"),
+            ("Two blocks change bowls", OURS, "swap", "bar 0.80"),
+            ("As in the picture", OURS, "picture", "bar 0.75"),
+        )
+    ],
+    headline=HEADLINE,
+    first=("plain", "occupied", "covered", "swap", "tower", "picture"),
+    files=lambda run, found: {
+        "timings.json": json.dumps(seconds(found), indent=2) + "\n",
+        "episodes.json": json.dumps(episodes(found), indent=1) + "\n",
+    },
+)
+
+if __name__ == "__main__":
+    start(STUDY)
