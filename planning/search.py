@@ -162,6 +162,8 @@ class SearchPlanner:
         began = perf_counter()
         parsed, grounding, wanted = self.look(rgb, goal, grounder)
         things, sentences = sorted(grounding.things), grounding.instructions()
+        if isinstance(goal, Goal):  # its own sentences first: of equally good plans the obvious one
+            sentences = tuple(sorted(sentences, key=lambda one: one not in goal.instructions))
         if not sentences:
             raise GroundingError(f"nothing can be said of {', '.join(map(str, things)) or 'an empty scene'}")
         start = _State(parsed, 0)
