@@ -97,6 +97,7 @@ class LoopEpisode:
             goal,
             seed=self.scene.seed,
             options=sampled.options(self.variant),
+            controller=method.controller,
             ground=(SegmentationGrounder if method.privileged else AppearanceGrounder).from_info,
             replan=method.replan,
         )

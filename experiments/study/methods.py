@@ -8,11 +8,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from experiments.report.tables import Line, Paper
-from planning import BeamPlanner, Goal, Imagines, Planner, RandomPlanner
+from planning import (
+    BeamPlanner,
+    Controller,
+    Foresees,
+    Goal,
+    Imagines,
+    LiteralController,
+    LiteralPlanner,
+    Planner,
+    RandomPlanner,
+)
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
@@ -31,6 +42,7 @@ class Method(Line):
     train: str = ""  # what to type to train it
     # makes the planner with which it acts in the closed loop; None for one that does not
     plan: MakePlanner | None = None
+    controller: type[Controller] | type[LiteralController] = Controller  # makes actions of its plans
     replan: bool = True  # whether it looks again after every action, and plans anew
     chance: int = 0  # methods of other numbers draw other random numbers
     privileged: bool = False  # whether its planner is told by the simulator's segmentation which slot is what
@@ -58,6 +70,10 @@ def _best(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> P
 
 def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
     return RandomPlanner(model, rng, depth=1, horizon=HORIZON, seed=seed)
+
+
+def _literal(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
+    return LiteralPlanner(cast(Foresees, model), seed=seed)  # which it never asks
 
 
 def _paper_frames(
@@ -203,6 +219,14 @@ METHODS: dict[str, Method] = {
             hue=2,
             note="the first frame's masks held still",
             paper=_COPY_SEED,
+        ),
+        Method(
+            key="no imagination",
+            kind="control",
+            hue=4,
+            note="picks where the named block is seen, places where the named bowl is seen",
+            plan=_literal,
+            controller=LiteralController,
         ),
         Method(key="expert", kind="ceiling", hue=1, note="scripted, knows every pose", expert=True),
         Method(
