@@ -41,6 +41,8 @@ from planning.planners import (
 )
 from planning.relations import RELATIONS, THRESHOLDS, Relation, Thresholds
 from planning.scores import (
+    DEFAULT_CRITERION,
+    DEFAULT_SCORE,
     CarryScore,
     PlacementScore,
     Score,
@@ -62,6 +64,8 @@ from planning.search import (
 )
 
 __all__ = [
+    "DEFAULT_CRITERION",
+    "DEFAULT_SCORE",
     "RELATIONS",
     "THRESHOLDS",
     "AnyGoal",
