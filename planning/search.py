@@ -30,10 +30,13 @@ SAME_PLACE_PX = 4.0
 # Imagined states in which nothing is farther apart than this, in pixels, are one state.
 MERGED_PX = 2.0
 SHOWN = 100  # candidates that a plan keeps
+HORIZON = 24  # frames of a film, where the model sets no limit
 
 
 class Foresees(Imagines, Protocol):
     """All that a search knows of a world model."""
+
+    longest_horizon: int | None  # frames that a film can have
 
     def outcome(self, obs: Rollout, text: Sequence[str], *, seed: int = 0) -> Rollout:
         """Where n texts lead from one scene (B = 1): n rollouts of two frames, before and after."""
@@ -139,9 +142,23 @@ class _State:
         return (*self.before.rollouts(), self.batch.select(self.row))
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What is seen and wanted."""
+
+    parsed: Rollout
+    grounding: Grounding
+    wanted: Wanted
+    things: Sequence[Thing]
+
+
 @dataclass
 class SearchPlanner:
-    """A* search over sentences, with a budget, that stops at the first imagined state in which the goal holds.
+    """A* search over sentences, with a budget, for the fewest after which the goal is foreseen to hold.
+
+    Whoever searches finds the model's errors, too: a state that only a slip of the model makes a goal. So the shortest
+    plans are imagined once more as films, by the model's other predictor, and one is taken that both believe in; if
+    there is none, the search goes on for longer ones.
 
     Raises:
         ValueError: if the budget or the depth is below 1.
@@ -150,6 +167,7 @@ class SearchPlanner:
     world_model: Foresees
     budget: int = 1000  # sentences that are imagined at most
     depth: int = 4  # sentences of a plan at most
+    checked: int = 12  # plans of which films are imagined at most; 0 trusts the search alone
     seed: int = 0  # of the slot sampling
 
     def __post_init__(self) -> None:
@@ -166,33 +184,60 @@ class SearchPlanner:
             sentences = tuple(sorted(sentences, key=lambda one: one not in goal.instructions))
         if not sentences:
             raise GroundingError(f"nothing can be said of {', '.join(map(str, things)) or 'an empty scene'}")
+        look = _Look(parsed, grounding, wanted, things)
         start = _State(parsed, 0)
-        found: list[_State] = []
+        found: list[_State] = []  # all that was imagined
+        goals: list[_State] = []  # those of one length in which the goal holds
         known_MN2 = places(parsed, grounding, things)
         frontier: list[tuple[tuple[int, int, float], int, _State]] = [((0, 0, 0.0), 0, start)]
-        left = self.budget
+        left, best = self.budget, None
         while frontier and left:
             _, _, state = heappop(frontier)
+            if goals and state.key[0] > len(goals[0].instructions):  # nothing that is as short is left
+                if (best := self._borne_out(goals, look)) is not None:
+                    break
+                goals = []
             if state.before is not None and state.unmet == 0:
-                break
-            if len(state.instructions) == self.depth:
-                continue
-            said, left = sentences[:left], left - len(sentences[:left])
-            ends = self._foresee(state.batch.last.select(state.row), said, grounding)
-            places_BN2 = places(ends, grounding, things)
-            ratios_BG = wanted.ratios(places_BN2).numpy()
-            for row, (one, ratios_G) in enumerate(zip(said, ratios_BG, strict=True)):
-                if ((known_MN2 - places_BN2[row]).norm(dim=-1).amax(1) < MERGED_PX).any():
-                    continue
-                known_MN2 = torch.cat([known_MN2, places_BN2[row : row + 1]])
-                new = _State(ends, row, (*state.instructions, one), state, ratios_G)
-                found.append(new)
-                heappush(frontier, (new.key, len(found), new))
+                goals.append(state)
+            elif len(state.instructions) < (len(goals[0].instructions) if goals else self.depth):
+                said, left = sentences[:left], left - len(sentences[:left])
+                ends = self._foresee(state.batch.last.select(state.row), said, grounding)
+                places_BN2 = places(ends, grounding, things)
+                ratios_BG = wanted.ratios(places_BN2).numpy()
+                for row, (one, ratios_G) in enumerate(zip(said, ratios_BG, strict=True)):
+                    new = _State(ends, row, (*state.instructions, one), state, ratios_G)
+                    known_M = (known_MN2 - places_BN2[row]).norm(dim=-1).amax(1) < MERGED_PX
+                    if known_M.any() and new.unmet:  # of ways to the goal all are kept: some may be slips
+                        continue
+                    known_MN2 = torch.cat([known_MN2, places_BN2[row : row + 1]])
+                    found.append(new)
+                    heappush(frontier, (new.key, len(found), new))
         if not found:  # as far as can be foreseen, nothing changes anything
             raise GroundingError("no sentence is imagined to move anything")
         found.sort(key=lambda one: (one.unmet, one.key))
-        ranking = tuple(Candidate(one.instructions, -one.away, one.unmet == 0) for one in found[:SHOWN])
-        return Plan(ranking, found[0].rollouts(), grounding, perf_counter() - began)
+        if not goals:  # the budget may have ended before it was their turn
+            waiting = sorted((one for *_, one in frontier if one.unmet == 0), key=lambda one: one.key)
+            goals = [one for one in waiting if one.key[0] == waiting[0].key[0]]
+        best = best or self._borne_out(goals, look) or (found[0], found[0].rollouts())
+        ranked = [best[0], *(one for one in found[:SHOWN] if one is not best[0])]
+        ranking = tuple(Candidate(one.instructions, -one.away, one.unmet == 0) for one in ranked)
+        return Plan(ranking, best[1], grounding, perf_counter() - began)
+
+    def _borne_out(self, goals: Sequence[_State], look: _Look) -> tuple[_State, tuple[Rollout, ...]] | None:
+        """Of goal states of one length the first whose films end in the goal, too, and these; None if there is none."""
+        if not goals or not self.checked:
+            return (goals[0], goals[0].rollouts()) if goals else None
+        goals = sorted(goals, key=lambda one: one.away)[: self.checked]
+        films: list[Rollout] = []
+        for step in range(len(goals[0].instructions)):
+            texts = [one.instructions[step].text for one in goals]
+            before = films[-1].last if films else look.parsed.select([0] * len(goals))
+            horizon = self.world_model.longest_horizon or HORIZON
+            films.append(self.world_model.rollout(before, texts, horizon=horizon, seed=self.seed))
+        ends_BG = look.wanted.ratios(places(films[-1], look.grounding, look.things))
+        for row in torch.nonzero((ends_BG <= 1).all(1)).flatten().tolist():
+            return goals[row], tuple(film.select(row) for film in films)
+        return None
 
     def reached(self, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder) -> bool:
         """Whether everything is seen to be where it shall be."""
@@ -218,8 +263,11 @@ class SearchPlanner:
         return self.world_model.outcome(state, [one.text for one in said], seed=self.seed)
 
 
+@dataclass
 class BelievingPlanner(SearchPlanner):
     """The same search, but every sentence is believed to come true as it says. A control row."""
+
+    checked: int = 0
 
     def _foresee(self, state: Rollout, said: Sequence[Instruction], grounding: Grounding) -> Rollout:
         positions_BK2 = state.positions[:, -1].repeat(len(said), 1, 1)
