@@ -67,6 +67,7 @@ def run_episode(
     seed: int | None = None,
     options: Mapping[str, Any] | None = None,
     max_attempts: int = 3,
+    max_actions: int | None = None,
     replan: bool = True,
 ) -> EpisodeResult:
     """Reset a `control="primitive"` environment and pursue a goal in it.
@@ -82,6 +83,7 @@ def run_episode(
         seed, options: for `env.reset`; for a variant of a scene pass `options={"instruction": ...}`, so that the
             simulator judges the goal that is pursued.
         max_attempts: pick-and-places at most (per instruction of the goal).
+        max_actions: the same in all, instead.
         replan: look again after each action, and plan anew while the goal is not reached. Otherwise one plan is made
             and carried out to its end.
 
@@ -101,7 +103,7 @@ def run_episode(
     attempts: list[Attempt] = []
     queue: list[tuple[Instruction, Rollout]] = []
     reached, gained, error = False, 0.0, None
-    for _ in range(max_attempts * goal.steps):
+    for _ in range(max_actions or max_attempts * goal.steps):
         try:
             if not queue:
                 plan = planner.plan(rgb, goal, ground(info))
