@@ -198,7 +198,9 @@ class SearchPlanner:
                     break
                 goals = []
             if state.before is not None and state.unmet == 0:
-                goals.append(state)
+                # One sentence may bring about several parts: a shorter way can come to light late.
+                shorter = goals and len(state.instructions) < len(goals[0].instructions)
+                goals = [state] if shorter else [*goals, state]
             elif len(state.instructions) < (len(goals[0].instructions) if goals else self.depth):
                 said, left = sentences[:left], left - len(sentences[:left])
                 ends = self._foresee(state.batch.last.select(state.row), said, grounding)
