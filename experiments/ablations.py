@@ -267,9 +267,9 @@ class FollowingScene:
             with warnings.catch_warnings():
                 # That a text encoder has never met a colour's name is what the unseen colours are about.
                 warnings.filterwarnings("ignore", "the text encoder has never met", UserWarning)
-                rollout, ours, wrong = imagine_and_judge(
-                    one.model(worker), sampled.observation["rgb"], ground, sampled.texts, self.seed
-                )
+                model = one.model(worker)
+                parsed = model.parse(sampled.observation["rgb"][None], seed=self.seed, num_slots=one.num_slots)
+                rollout, ours, wrong = imagine_and_judge(model, parsed, ground, sampled.texts, self.seed)
             for metric, good_V in ((ENDS, ours.miss_SV[0] < NEAR), ("predicted_success", ours.success_SV[0])):
                 figures[one.name, "original", metric] = good_V[0]
                 if self.variants:

@@ -27,6 +27,7 @@ from experiments.study.pool import Worker
 from experiments.study.run import run
 from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
+from textocvp import WorldModel
 
 SHIPPED = Path(textocvp.__file__).parent / "checkpoints" / "tabletop-small"
 
@@ -152,6 +153,15 @@ def test_a_scene_is_followed_by_a_model_that_is_always_right_and_by_one_that_nev
         ("right", "original", "predicted_success"),
         ("right", "original", "ends_within_6_px"),
     }
+
+
+def test_a_scene_is_imagined_with_as_many_slots_as_asked() -> None:
+    (scene,) = study_scenes("test", 1, 0)
+    who = (Entrant("few", num_slots=3), Entrant("enough", num_slots=12))
+    figures = FollowingScene(scene, who, 0, 0).run(Worker(WorldModel.from_pretrained())).figures
+    # Background and arm take two of them, so one is left for a block and a bowl.
+    reached = {name: bool(figures[name, "original", "ends_within_6_px"]) for name in ("few", "enough")}
+    assert reached == {"few": False, "enough": True}
 
 
 def test_the_plot_shows_the_columns_that_it_names(runs: Path) -> None:
