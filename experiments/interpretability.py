@@ -14,6 +14,7 @@ because that term alone could decide. Writes `results.json`, `report.html`, plot
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -24,10 +25,10 @@ import torch
 from envs.colors import SEEN
 from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Figure, Section
-from experiments.report.plots import curve_plot, heat_grid, heat_map, plot_table
+from experiments.report.plots import curve_plot, heat_grid, heat_map
 from experiments.report.results import Results
-from experiments.report.rows import Key, Row, figure_rows
-from experiments.report.tables import Column, Line, Table, TableSpec, columns
+from experiments.report.rows import Key, figure_rows
+from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import tone
 from experiments.study.judge import find_things
 from experiments.study.methods import HORIZON
@@ -74,11 +75,8 @@ class Sizes:
 
 # --- reading attention ------------------------------------------------------------------------------------------------
 
-
-def words_of(text: str) -> tuple[str, ...]:
-    """`TEMPLATE` with the colours of an instruction."""
-    block, bowl = Instruction.parse(text).things
-    return ("put", "the", block.color, "block", "in", "the", bowl.color, "bowl")
+NO_LETTERS = re.compile(r"^<.*>$|^\[.*\]$|^(\u2581|##|\u0120)|\s")
+"""What spells nothing: special tokens as </s> and [CLS], and how tokenizers mark where a word begins or goes on."""
 
 
 def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.ndarray:
@@ -89,22 +87,17 @@ def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.nda
     Raises:
         UsageError: if the tokens do not spell the words of the text.
     """
-    words, spelled = [word.replace(" ", "") for word in words_of(text)], [""]
+    block, bowl = (thing.color.replace(" ", "") for thing in Instruction.parse(text).things)
+    words = ("put", "the", block, "block", "in", "the", bowl, "bowl")
+    spelled = [NO_LETTERS.sub("", token).lower() for token in tokens]
     merged = np.zeros((*values.shape[:-1], len(words)), dtype=values.dtype)
-    for column, token in enumerate(tokens):
-        letters = token.lower().replace(" ", "")
-        for mark in ("\u2581", "##", "\u0120"):  # how tokenizers mark the begin of a word, or its going on
-            letters = letters.removeprefix(mark)
-        if not letters or (token[0], token[-1]) in (("<", ">"), ("[", "]")):  # as in </s> and [CLS]
-            continue
-        if spelled[-1] == words[len(spelled) - 1]:
-            spelled.append("")
-        spelled[-1] += letters
-        if len(spelled) > len(words) or not words[len(spelled) - 1].startswith(spelled[-1]):
-            break
-        merged[..., len(spelled) - 1] += values[..., column]
-    if spelled != words:
+    ends, letters = np.cumsum([len(word) for word in words]), 0
+    if "".join(spelled) != "".join(words):
         raise UsageError(f"the tokens {list(tokens)} do not spell the words of {text!r}")
+    for column, token in enumerate(spelled):
+        if token:
+            merged[..., np.searchsorted(ends, letters, side="right")] += values[..., column]
+        letters += len(token)
     return merged
 
 
@@ -121,7 +114,9 @@ class AttentionReading:
     most_Rnh: np.ndarray  # the same for each layer and head, by means over T
     most_RT: np.ndarray  # the same for each step, by means over n and h
     chance_R: np.ndarray  # the thing's share of the present slots
-    margin_R: np.ndarray  # how far its share is above the largest of all others (negative: below), or nan
+    lead_R: (
+        np.ndarray
+    )  # how far its share is above the largest of all others (negative: below); -inf without a slot
     shares_RTG: np.ndarray  # each group's mean share for the role's colour word; nan without such a thing
     map_nhGW: np.ndarray  # each group's mean shares over T
     ends_in_bowl: bool  # whether the named block's slot ends near where the named bowl's slot was
@@ -148,7 +143,7 @@ def read_attention(
         most_Rnh=leads(0) > 0,
         most_RT=leads(1, 2) > 0,
         chance_R=np.array([present_K[slots].sum() / present_K.sum() for slots in slots_R]),
-        margin_R=np.where(np.isfinite(lead_R), lead_R, np.nan),
+        lead_R=lead_R,
         shares_RTG=np.array([_group_means(shares.mean((1, 2)), groups) for shares in shares_R]),
         map_nhGW=_group_means(attention_TnhKW.mean(0).swapaxes(-1, -2), groups).swapaxes(-1, -2),
         ends_in_bowl=ends,
@@ -272,9 +267,8 @@ def scene_figures(
             if misread and own.things[r] != wrong.things[r]:
                 figures[WRONG, variant, METRICS[r]] = misread[0].most_R[r]
             figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
-            margins = [one.margin_R[r] for one in ours]
-            if not np.isnan(margins).all():
-                figures[OURS, variant, f"lead_{ROLES[r]}"] = np.nanmean(margins)
+            if leads := [one.lead_R[r] for one in ours if np.isfinite(one.lead_R[r])]:
+                figures[OURS, variant, f"lead_{ROLES[r]}"] = np.mean(leads)
         if any(counts_R):
             for method in imagined:
                 figures[method, variant, ENDS] = [one.ends_in_bowl for one in readings[method][texts]]
@@ -290,15 +284,10 @@ def scene_figures(
 def imagine(
     model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int
 ) -> tuple[list[np.ndarray], Rollout]:
-    """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`.
-
-    Raises:
-        UsageError: if the model reads no text.
-    """
+    """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`."""
     horizon = min(HORIZON, model.longest_horizon or HORIZON)
     rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
-    if rollout.attention is None:
-        raise UsageError(f"{model.checkpoint.name} keeps no attention from slots to words: it reads no text")
+    assert rollout.attention is not None  # `check_model` saw to it
     pairs = zip(rollout.attention.double().cpu().numpy(), texts, strict=True)
     return [merge_tokens(attention, model.words(text), text) for attention, text in pairs], rollout
 
@@ -323,22 +312,13 @@ class AttentionPicture:
     variants: int  # see `AttentionScene`
     seed: int
     variant: int  # which of its texts
-    reading: AttentionReading
+    lead: float  # what it is chosen for: the smaller one of the two things, -inf if one has no slot
+    success: bool  # whether both named things attend most to their colour words
     best: bool = True
     rank: int = 1  # its place among the best or the worst
 
-    @property
-    def margin(self) -> float:
-        """What it is chosen for: the smaller of the two leads. A thing without a slot is the worst case there is."""
-        return float(np.nan_to_num(self.reading.margin_R, nan=-np.inf).min())
-
-    @property
-    def success(self) -> bool:
-        """Whether both named things attend most to their colour words."""
-        return bool(self.reading.most_R.all())
-
-    def run(self, worker: Worker) -> tuple[Clip, Figure | None]:
-        """Imagine it once more, and paint: a clip, and for the first of each kind a map of slots and words."""
+    def run(self, worker: Worker) -> Clip:
+        """Imagine it once more, and paint."""
         sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
         parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=self.seed)
         text, kind = sampled.texts[self.variant], "best" if self.best else "worst"
@@ -346,24 +326,16 @@ class AttentionPicture:
         frames_THW3, masks_TKHW = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
         shares_TKW = attention_TnhKW.mean((1, 2))
         glowing = [glow(frames_THW3, masks_TKHW, shares_TKW[..., word]) for word in COLOR_WORDS]
-        figure = f"lead {self.margin:.3f}" if np.isfinite(self.margin) else "a named thing has no slot"
-        things = Instruction.parse(text).things
-        clip = Clip(
+        figure = f"lead {self.lead:.3f}" if np.isfinite(self.lead) else "a named thing has no slot"
+        return Clip(
             name=f"attention-{kind}-{self.rank}.gif",
             gif=gif([[frames_THW3, *glowing]]),
-            panels=("imagined", *(f'"{thing.color}"' for thing in things)),
+            panels=("imagined", *(f'"{thing.color}"' for thing in Instruction.parse(text).things)),
             title=text,
             caption=f"{self.scene.split.replace('_', ' ')}, seed {self.scene.seed}; {figure}",
             badge=f"{kind} {self.rank}: {'both attend most' if self.success else 'missed'}",
             tone=tone(self.success),
         )
-        if self.rank > 1:
-            return clip, None
-        groups, caption = (
-            [*map(str, things), *GROUPS[2:]],
-            f"The {kind} case: mean share over steps, layers and heads.",
-        )
-        return clip, word_map(f"words-{kind}.png", [self.reading], caption, groups, words_of(text))
 
 
 def glow(frames_THW3: np.ndarray, masks_TKHW: np.ndarray, shares_SK: np.ndarray) -> np.ndarray:
@@ -403,14 +375,21 @@ def units(run: Run) -> dict[str, Part]:
 def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -> list[AttentionPicture]:
     """The cases with the largest and the smallest lead of the named things, each of another scene."""
     every = [
-        AttentionPicture(outcome.scene, len(outcome.readings[OURS]) - 1, seed, v, reading)
+        AttentionPicture(
+            outcome.scene,
+            len(outcome.readings[OURS]) - 1,
+            seed,
+            v,
+            float(one.lead_R.min()),
+            bool(one.most_R.all()),
+        )
         for outcome in outcomes
-        for v, reading in enumerate(outcome.readings[OURS])
+        for v, one in enumerate(outcome.readings[OURS])
     ]
     chosen = []
     for best in (True, False):
         firsts: dict[int, AttentionPicture] = {}
-        for case in sorted(every, key=lambda case: case.margin, reverse=best):
+        for case in sorted(every, key=lambda case: case.lead, reverse=best):
             firsts.setdefault(case.scene.seed, case)
         ranked = enumerate(list(firsts.values())[:count], start=1)
         chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
@@ -431,69 +410,55 @@ def headline(run: Run) -> dict[str, Key]:
 
 # --- tables and page --------------------------------------------------------------------------------------------------
 
-LINES = {
-    line.key: line
-    for line in (
-        Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only"),
-        Line(key=BY_APPEARANCE, hue=1, note="slots named by their appearance, as the planner does it"),
-        Line(key=NO_COLOR_TERM, kind="control", hue=3, note="the same weights without the term that compares colours"),
-        Line(key=COLOR_TERM, kind="control", note="that term alone: whose colour is nearest to the word's, no network"),
-        Line(key=WRONG, kind="control", hue=4, note="under a sentence that names other things: should be near 0"),
-        Line(key=CHANCE, kind="control", hue=2, note="one guess among the slots that are present"),
-    )
-}  # fmt: skip
+OURS_LINE = Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only")
+NO_TERM = Line(
+    key=NO_COLOR_TERM, kind="control", note="the same weights without the term that compares colours"
+)
+WRONG_LINE = Line(
+    key=WRONG, kind="control", note="under a sentence that names other things: should be near 0"
+)
+CHANCE_LINE = Line(key=CHANCE, kind="control", note="one guess among the slots that are present")
+LINES = (
+    OURS_LINE,
+    Line(key=BY_APPEARANCE, note="slots named by their appearance, as the planner does it"),
+    NO_TERM,
+    Line(
+        key=COLOR_TERM,
+        kind="control",
+        note="that term alone: whose colour is nearest to the word's, no network",
+    ),
+    WRONG_LINE,
+    CHANCE_LINE,
+)
 ATTENDS_TABLES = [
-    TableSpec(
-        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), [*LINES.values()]
-    )
+    TableSpec(f"The named {role} attends most to its colour word", columns(metric, COLUMNS), LINES)
     for role, metric in zip(ROLES, METRICS, strict=True)
 ]
 ENDS_TABLE = TableSpec(
-    "The named block ends in the named bowl",
-    columns(ENDS, COLUMNS),
-    [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)],
+    "The named block ends in the named bowl", columns(ENDS, COLUMNS), (OURS_LINE, NO_TERM, WRONG_LINE)
 )
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    rows, here = list(results.rows), [one for one in found["scenes"] if one.scene.split == VARIED]
-    readings = {
-        method: [one for o in here for one in o.readings[method]]
-        for method in (OURS, NO_COLOR_TERM)
-        if method in here[0].readings
-    }
-    ours = readings[OURS]
-    # A scene's texts are not independent: one curve a scene.
-    shares_NRTG = np.array([_nanmean([one.shares_RTG for one in o.readings[OURS]]) for o in here])
-    most_NRT = np.array([np.mean([one.most_RT for one in o.readings[OURS]], axis=0) for o in here])
-    dotted = [line for line in LINES.values() if line.key != COLOR_TERM]
-    dots, curves = [], []
-    for r, (role, table) in enumerate(zip(ROLES, ATTENDS_TABLES, strict=True)):
-        label = f"named {role} attends most"
-        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=dotted))
-        shares = {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)}
-        caption = "Mean over scenes with its 95 % interval."
-        curves.append(plot_curves(f"shares_{role}.png", shares, f"share for the {role}'s colour", caption))
-    most = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
-    caption = "Share of instructions in which the named thing attends most to its colour word, step by step."
-    chance = (float(np.mean([one.chance_R for one in ours])), "chance")
-    curves.append(plot_curves("most.png", most, "attends most", caption, [chance]))
-    mean_over = "Mean over scenes, instructions, steps, layers and heads"
-    maps_nhGW, groups = group_maps(ours, GROUPS)
-    layers = [f"layer {n + 1}" for n in range(maps_nhGW.shape[0])]
-    heads = [f"head {h + 1}" for h in range(maps_nhGW.shape[1])]
-    titles = [[f"{layer}, {head}" for head in heads] for layer in layers]
+    here = [one.readings for one in found["scenes"] if one.scene.split == VARIED]
+    methods = [method for method in (OURS, NO_COLOR_TERM) if method in here[0]]
+    every = {method: [one for readings in here for one in readings[method]] for method in methods}
+    maps_nhGW = mean_known([one.map_nhGW for one in every[OURS]])
+    there = [g for g in range(len(GROUPS)) if not np.isnan(maps_nhGW[:, :, g]).any()]
+    groups, maps_nhGW = [GROUPS[g] for g in there], maps_nhGW[:, :, there]
+    layers, heads = (
+        [f"{name} {i + 1}" for i in range(n)] for name, n in zip(("layer", "head"), maps_nhGW.shape)
+    )
     by_head = []
-    for method, ending, of in ((OURS, "", ""), (NO_COLOR_TERM, "_no_colour_term", f", {NO_COLOR_TERM}")):
-        for r, role in enumerate(ROLES if method in readings else ()):
-            most_nh = np.mean([one.most_Rnh[r] for one in readings[method]], axis=0)
-            caption = f"How often the named {role} attends most to its colour word{of}."
+    for method, ending in zip(methods, ("", "_no_colour_term"), strict=False):
+        for r, role in enumerate(ROLES):
+            most_nh = np.mean([one.most_Rnh[r] for one in every[method]], axis=0)
+            caption = f"{method}: how often the named {role} attends most to its colour word."
             name = f"heads_{role}{ending}.png"
             by_head.append(
                 heat_map(name, most_nh, layers, heads, label="attends most", top=1.0, caption=caption)
             )
-    together = "The same for each layer and head. All maps share one scale."
     sections = [
         Section(
             "How often does the named thing attend most?",
@@ -503,7 +468,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave "
             "no slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is "
             "in no training caption.",
-            [*(measured(table, rows) for table in ATTENDS_TABLES), *dots],
+            [table.table(results.rows) for table in ATTENDS_TABLES],
         ),
         Section(
             "Head by head",
@@ -512,89 +477,73 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         ),
         Section(
             "What each thing attends to",
-            "Mean share of each thing's slots for each word: over all heads, and head by head.",
+            "Mean share of each thing's slots for each word, over scenes, instructions and steps.",
             [
-                word_map("attention.png", ours, f"{mean_over} (all heads)."),
-                heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE, titles,
-                          label="attention to words", caption=together),
-                *(words for _, words in found["pictures"] if words),
+                heat_map("attention.png", maps_nhGW.mean((0, 1)), groups, SHORT_WORDS,
+                         label="attention to words", caption="Mean over layers and heads."),
+                heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE,
+                          [[f"{layer}, {head}" for head in heads] for layer in layers],
+                          label="attention to words", caption="Head by head. All maps share one scale."),
             ],
         ),
         Section(
             "Over time",
-            "Shares for the two colour words while the arm reaches, carries and retreats; mean over layers and heads.",
-            curves,
+            "For the two colour words while the arm reaches, carries and retreats; mean over layers and heads. Bands "
+            "are 95 % intervals over scenes.",
+            curves([readings[OURS] for readings in here]),
         ),
         Section(
             "Seen over the picture",
             "The cases in which the named things lead the most and the least. Each slot glows with its share of "
             "attention to the block's colour word and to the bowl's.",
-            [Clips([clip for clip, _ in found["pictures"]])],
+            [Clips(found["pictures"])],
         ),
     ]  # fmt: skip
-    if NO_COLOR_TERM in readings:
+    if NO_COLOR_TERM in methods:
         text = (
             "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
             "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
             f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
             "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
         )
-        caption = f"{mean_over} (without the colour term)."
-        without = word_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], caption)
-        ends = measured(ENDS_TABLE, rows)
-        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends, without]))
+        ends = ENDS_TABLE.table(results.rows)
+        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends]))
     return sections
-
-
-def measured(spec: TableSpec, rows: Sequence[Row]) -> Table:
-    """A table without the lines of what this model does not have."""
-    return replace(spec, lines=[line for line in spec.lines if any(spec.points(rows, line))]).table(rows)
-
-
-def _nanmean(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Over the first axis; nan where nothing is known."""
-    seen = ~np.isnan(values)
-    sums = np.where(seen, values, 0.0).sum(0)
-    return np.where(seen.any(0), sums / np.maximum(seen.sum(0), 1), np.nan)
 
 
 SHORT_WORDS = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
 
 
-def group_maps(readings: Sequence[AttentionReading], groups: Sequence[str]) -> tuple[np.ndarray, list[str]]:
-    """Mean maps (n, h, G, W) of the groups that there are, and their names."""
-    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
-    there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3))).tolist()
-    return maps_nhGW[:, :, there], [groups[g] for g in there]
+def mean_known(values: Any) -> np.ndarray:
+    """Over the first axis; nan where nothing is known."""
+    return np.asarray(np.ma.masked_invalid(values).mean(0).filled(np.nan))
 
 
-def word_map(
-    name: str,
-    readings: Sequence[AttentionReading],
-    caption: str,
-    groups: Sequence[str] = GROUPS,
-    words: Sequence[str] = SHORT_WORDS,
-) -> Figure:
-    """Mean share of each group's slots for each word."""
-    maps_nhGW, groups = group_maps(readings, groups)
-    return heat_map(name, maps_nhGW.mean((0, 1)), groups, words, label="attention to words", caption=caption)
+def curves(readings: Sequence[Sequence[AttentionReading]]) -> list[Figure]:
+    """Step by step: the share of each group for each colour word, and how often the named thing attends most.
+
+    Args:
+        readings: of each scene. Its texts are not independent, so they are averaged first.
+    """
+    shares_NRTG = np.array([mean_known([one.shares_RTG for one in its]) for its in readings])
+    most_NRT = np.array([np.mean([one.most_RT for one in its], axis=0) for its in readings])
+    chance = float(np.mean([one.chance_R for its in readings for one in its]))
+    figures = []
+    for r, role in enumerate(ROLES):
+        shares = [(group, curve(shares_NRTG[:, r, :, g])) for g, group in enumerate(GROUPS)]
+        known = [one for one in shares if len(one[1])]
+        label = f"share for the {role}'s colour"
+        figures.append(curve_plot(f"shares_{role}.png", known, label=label, across="step"))
+    most = [(f"named {role}", curve(most_NRT[:, r])) for r, role in enumerate(ROLES)]
+    marks = [(chance, "chance")]
+    return [*figures, curve_plot("most.png", most, label="attends most", across="step", marks=marks)]
 
 
-def plot_curves(
-    name: str,
-    along_NT: Mapping[str, np.ndarray],
-    label: str,
-    caption: str,
-    marks: Sequence[tuple[float, str]] = (),
-) -> Figure:
-    """Means over scenes with intervals, step by step; nan for scenes that do not count."""
-    bands = []
-    for title, values_NT in along_NT.items():
-        known = values_NT[~np.isnan(values_NT).any(1)]
-        intervals = [bootstrap_interval(column, resamples=500) for column in known.T if len(known)]
-        if intervals:
-            bands.append((title, np.array([(one.value, one.low, one.high) for one in intervals])))
-    return curve_plot(name, bands, label=label, across="step", caption=caption, marks=marks)
+def curve(values_NT: np.ndarray) -> np.ndarray:
+    """(T, 3) mean over scenes, low, high; without the scenes that have no such thing, and empty if all have none."""
+    known_NT = values_NT[~np.isnan(values_NT).any(1)]
+    intervals = [bootstrap_interval(column, resamples=500) for column in known_NT.T if len(known_NT)]
+    return np.array([(one.value, one.low, one.high) for one in intervals])
 
 
 _, PLAIN, OTHERS, _, NEW = COLUMNS.values()
@@ -611,16 +560,16 @@ STUDY = Study(
     tables=[*ATTENDS_TABLES, ENDS_TABLE],
     page=page,
     cards=[
-        CardSpec(label, LINES[method], Column("", *place, metric), compare)
-        for label, method, place, metric, compare in (
-            ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
-            ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
-            ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
-            ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
-            ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
-            ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
-            ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
-            ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
+        CardSpec(label, line, Column("", *place, metric), compare)
+        for label, line, place, metric, compare in (
+            ("Block, original", OURS_LINE, PLAIN, METRICS[0], "not in the paper"),
+            ("Bowl, original", OURS_LINE, PLAIN, METRICS[1], "not in the paper"),
+            ("Bowl, three other bowls", OURS_LINE, OTHERS, METRICS[1], "not in the paper"),
+            ("Block, new colour names", OURS_LINE, NEW, METRICS[0], "not in the paper"),
+            ("Bowl, wrong sentence", WRONG_LINE, PLAIN, METRICS[1], "should be near 0"),
+            ("Chance", CHANCE_LINE, PLAIN, METRICS[1], "one guess among the slots"),
+            ("Bowl, colour term off", NO_TERM, PLAIN, METRICS[1], "what the rest has learned"),
+            ("Ends in bowl, colour term off", NO_TERM, PLAIN, ENDS, "what the motion owes to it"),
         )
     ],
     headline=headline,
