@@ -114,9 +114,7 @@ class AttentionReading:
     most_Rnh: np.ndarray  # the same for each layer and head, by means over T
     most_RT: np.ndarray  # the same for each step, by means over n and h
     chance_R: np.ndarray  # the thing's share of the present slots
-    lead_R: (
-        np.ndarray
-    )  # how far its share is above the largest of all others (negative: below); -inf without a slot
+    lead_R: np.ndarray  # how far its share is above the largest of all others; -inf without a slot
     shares_RTG: np.ndarray  # each group's mean share for the role's colour word; nan without such a thing
     map_nhGW: np.ndarray  # each group's mean shares over T
     ends_in_bowl: bool  # whether the named block's slot ends near where the named bowl's slot was
@@ -375,17 +373,10 @@ def units(run: Run) -> dict[str, Part]:
 def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -> list[AttentionPicture]:
     """The cases with the largest and the smallest lead of the named things, each of another scene."""
     every = [
-        AttentionPicture(
-            outcome.scene,
-            len(outcome.readings[OURS]) - 1,
-            seed,
-            v,
-            float(one.lead_R.min()),
-            bool(one.most_R.all()),
-        )
-        for outcome in outcomes
-        for v, one in enumerate(outcome.readings[OURS])
-    ]
+        AttentionPicture(o.scene, len(o.readings[OURS]) - 1, seed, v, float(one.lead_R.min()), bool(one.most_R.all()))
+        for o in outcomes
+        for v, one in enumerate(o.readings[OURS])
+    ]  # fmt: skip
     chosen = []
     for best in (True, False):
         firsts: dict[int, AttentionPicture] = {}
@@ -410,33 +401,25 @@ def headline(run: Run) -> dict[str, Key]:
 
 # --- tables and page --------------------------------------------------------------------------------------------------
 
-OURS_LINE = Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only")
-NO_TERM = Line(
-    key=NO_COLOR_TERM, kind="control", note="the same weights without the term that compares colours"
-)
-WRONG_LINE = Line(
-    key=WRONG, kind="control", note="under a sentence that names other things: should be near 0"
-)
-CHANCE_LINE = Line(key=CHANCE, kind="control", note="one guess among the slots that are present")
-LINES = (
-    OURS_LINE,
-    Line(key=BY_APPEARANCE, note="slots named by their appearance, as the planner does it"),
-    NO_TERM,
-    Line(
-        key=COLOR_TERM,
-        kind="control",
-        note="that term alone: whose colour is nearest to the word's, no network",
-    ),
-    WRONG_LINE,
-    CHANCE_LINE,
-)
+LINES = {
+    line.key: line
+    for line in (
+        Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only"),
+        Line(key=BY_APPEARANCE, note="slots named by their appearance, as the planner does it"),
+        Line(key=NO_COLOR_TERM, kind="control", note="the same weights without the term that compares colours"),
+        Line(key=COLOR_TERM, kind="control", note="that term alone: whose colour is nearest to the word's, no network"),
+        Line(key=WRONG, kind="control", note="under a sentence that names other things: should be near 0"),
+        Line(key=CHANCE, kind="control", note="one guess among the slots that are present"),
+    )
+}  # fmt: skip
 ATTENDS_TABLES = [
-    TableSpec(f"The named {role} attends most to its colour word", columns(metric, COLUMNS), LINES)
+    TableSpec(
+        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), [*LINES.values()]
+    )
     for role, metric in zip(ROLES, METRICS, strict=True)
 ]
-ENDS_TABLE = TableSpec(
-    "The named block ends in the named bowl", columns(ENDS, COLUMNS), (OURS_LINE, NO_TERM, WRONG_LINE)
-)
+ENDS_LINES = [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)]
+ENDS_TABLE = TableSpec("The named block ends in the named bowl", columns(ENDS, COLUMNS), ENDS_LINES)
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
@@ -447,38 +430,29 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     maps_nhGW = mean_known([one.map_nhGW for one in every[OURS]])
     there = [g for g in range(len(GROUPS)) if not np.isnan(maps_nhGW[:, :, g]).any()]
     groups, maps_nhGW = [GROUPS[g] for g in there], maps_nhGW[:, :, there]
-    layers, heads = (
-        [f"{name} {i + 1}" for i in range(n)] for name, n in zip(("layer", "head"), maps_nhGW.shape)
-    )
-    by_head = []
-    for method, ending in zip(methods, ("", "_no_colour_term"), strict=False):
-        for r, role in enumerate(ROLES):
-            most_nh = np.mean([one.most_Rnh[r] for one in every[method]], axis=0)
-            caption = f"{method}: how often the named {role} attends most to its colour word."
-            name = f"heads_{role}{ending}.png"
-            by_head.append(
-                heat_map(name, most_nh, layers, heads, label="attends most", top=1.0, caption=caption)
-            )
+    layers = [f"layer {n + 1}" for n in range(len(maps_nhGW))]
+    heads = [f"head {h + 1}" for h in range(maps_nhGW.shape[1])]
+    by_head = [
+        heat_map(f"heads_{role}{ending}.png", np.mean([one.most_Rnh[r] for one in every[method]], axis=0), layers,
+                 heads, label="attends most", top=1.0, caption=f"{method}: the named {role} and its colour word.")
+        for method, ending in zip(methods, ("", "_no_colour_term"), strict=False)
+        for r, role in enumerate(ROLES)
+    ]  # fmt: skip
     sections = [
         Section(
             "How often does the named thing attend most?",
-            "Every slot divides its attention among the words: its shares sum to 1, less what a text encoder's special "
-            "tokens get. A slot attends most to a word if its share for that word is larger than that of every "
-            "other slot that is present, table included; equal is not more. Shares are averaged over steps, layers and "
-            "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave "
-            "no slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is "
-            "in no training caption.",
+            "Every slot divides its attention among the words: its shares sum to 1, less what special tokens get. It "
+            "attends most to a word if its share for that word is larger than that of every other present slot, table "
+            "included. Shares are averaged over steps, layers and heads first. A named thing without a slot counts as "
+            "a miss. New names: the scenes in which the thing's colour name is in no training caption.",
             [table.table(results.rows) for table in ATTENDS_TABLES],
         ),
         Section(
-            "Head by head",
-            "The same figure for each layer and head by itself, over all instructions of these scenes.",
-            by_head,
-        ),
-        Section(
-            "What each thing attends to",
-            "Mean share of each thing's slots for each word, over scenes, instructions and steps.",
+            "Head by head, and what each thing attends to",
+            "The same figure for each layer and head by itself, over all instructions of the scenes with 4 bowls. And "
+            "the mean share of each thing's slots for each word, over scenes, instructions and steps.",
             [
+                *by_head,
                 heat_map("attention.png", maps_nhGW.mean((0, 1)), groups, SHORT_WORDS,
                          label="attention to words", caption="Mean over layers and heads."),
                 heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE,
@@ -501,10 +475,10 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     ]  # fmt: skip
     if NO_COLOR_TERM in methods:
         text = (
-            "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
-            "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
-            f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
-            "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
+            "This predictor adds to the attention logits how well a slot's colour fits the lexicon's colour of the "
+            "word. With its learned gains set to 0 in a copy of the model, one sees what the rest has learned, and "
+            f"whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The copy was "
+            "not trained without the term: this says what these weights rely on, not what could be learned."
         )
         ends = ENDS_TABLE.table(results.rows)
         sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends]))
@@ -527,16 +501,14 @@ def curves(readings: Sequence[Sequence[AttentionReading]]) -> list[Figure]:
     """
     shares_NRTG = np.array([mean_known([one.shares_RTG for one in its]) for its in readings])
     most_NRT = np.array([np.mean([one.most_RT for one in its], axis=0) for its in readings])
-    chance = float(np.mean([one.chance_R for its in readings for one in its]))
-    figures = []
+    drawn = []
     for r, role in enumerate(ROLES):
         shares = [(group, curve(shares_NRTG[:, r, :, g])) for g, group in enumerate(GROUPS)]
-        known = [one for one in shares if len(one[1])]
-        label = f"share for the {role}'s colour"
-        figures.append(curve_plot(f"shares_{role}.png", known, label=label, across="step"))
+        known, label = [one for one in shares if len(one[1])], f"share for the {role}'s colour"
+        drawn.append(curve_plot(f"shares_{role}.png", known, label=label, across="step"))
     most = [(f"named {role}", curve(most_NRT[:, r])) for r, role in enumerate(ROLES)]
-    marks = [(chance, "chance")]
-    return [*figures, curve_plot("most.png", most, label="attends most", across="step", marks=marks)]
+    marks = [(float(np.mean([one.chance_R for its in readings for one in its])), "chance")]
+    return [*drawn, curve_plot("most.png", most, label="attends most", across="step", marks=marks)]
 
 
 def curve(values_NT: np.ndarray) -> np.ndarray:
@@ -560,16 +532,16 @@ STUDY = Study(
     tables=[*ATTENDS_TABLES, ENDS_TABLE],
     page=page,
     cards=[
-        CardSpec(label, line, Column("", *place, metric), compare)
-        for label, line, place, metric, compare in (
-            ("Block, original", OURS_LINE, PLAIN, METRICS[0], "not in the paper"),
-            ("Bowl, original", OURS_LINE, PLAIN, METRICS[1], "not in the paper"),
-            ("Bowl, three other bowls", OURS_LINE, OTHERS, METRICS[1], "not in the paper"),
-            ("Block, new colour names", OURS_LINE, NEW, METRICS[0], "not in the paper"),
-            ("Bowl, wrong sentence", WRONG_LINE, PLAIN, METRICS[1], "should be near 0"),
-            ("Chance", CHANCE_LINE, PLAIN, METRICS[1], "one guess among the slots"),
-            ("Bowl, colour term off", NO_TERM, PLAIN, METRICS[1], "what the rest has learned"),
-            ("Ends in bowl, colour term off", NO_TERM, PLAIN, ENDS, "what the motion owes to it"),
+        CardSpec(label, LINES[method], Column("", *place, metric), compare)
+        for label, method, place, metric, compare in (
+            ("Block, original", OURS, PLAIN, METRICS[0], "not in the paper"),
+            ("Bowl, original", OURS, PLAIN, METRICS[1], "not in the paper"),
+            ("Bowl, three other bowls", OURS, OTHERS, METRICS[1], "not in the paper"),
+            ("Block, new colour names", OURS, NEW, METRICS[0], "not in the paper"),
+            ("Bowl, wrong sentence", WRONG, PLAIN, METRICS[1], "should be near 0"),
+            ("Chance", CHANCE, PLAIN, METRICS[1], "one guess among the slots"),
+            ("Bowl, colour term off", NO_COLOR_TERM, PLAIN, METRICS[1], "what the rest has learned"),
+            ("Ends in bowl, colour term off", NO_COLOR_TERM, PLAIN, ENDS, "what the motion owes to it"),
         )
     ],
     headline=headline,
