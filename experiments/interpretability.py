@@ -200,8 +200,8 @@ class AttentionOutcome:
     """What was read of a scene with V texts: its own instruction and its variants."""
 
     scene: StudyScene
-    # method -> what was read, V readings, but one of `WRONG`. Slots are named by the simulator's segmentation of the
-    # first frame, for measuring only, except for `BY_APPEARANCE`.
+    # method -> what was read: V readings, one of `WRONG`, none of what the model does not have. Slots are named by the
+    # simulator's segmentation of the first frame, for measuring only, except for `BY_APPEARANCE`.
     readings: Mapping[str, Sequence[AttentionReading]]
     figures: Mapping[tuple[str, str, str], Any]  # see `figure_rows`
 
@@ -236,10 +236,14 @@ class AttentionScene:
 
         attention, rollout = imagine(model, parsed, [*texts, wrong], self.seed)
         *ours, misread = read(attention, rollout)
-        readings = {BY_APPEARANCE: read(attention[:-1], rollout, seen), OURS: ours, WRONG: [misread]}
-        if (without := without_color_term(model)) is not None:
-            readings[COLOR_TERM] = read(color_term(model, parsed, texts, present_K), rollout)
-            readings[NO_COLOR_TERM] = read(*imagine(without, parsed, texts, self.seed))
+        without = without_color_term(model)
+        readings = {
+            BY_APPEARANCE: read(attention[:-1], rollout, seen),
+            COLOR_TERM: read(color_term(model, parsed, texts, present_K), rollout) if without else [],
+            OURS: ours,
+            NO_COLOR_TERM: read(*imagine(without, parsed, texts, self.seed)) if without else [],
+            WRONG: [misread],
+        }
         figures = scene_figures(asked[0], Instruction.parse(wrong), readings)
         return AttentionOutcome(self.scene, readings, figures)
 
@@ -249,31 +253,26 @@ def scene_figures(
 ) -> dict[tuple[str, str, str], Any]:
     """Figures of a scene, of its own instruction and the wrong one; see `AttentionOutcome`."""
     figures: dict[tuple[str, str, str], Any] = {}
-    several = len(readings[OURS]) > 1
-    imagined = [method for method in (OURS, NO_COLOR_TERM) if method in readings]
-    read = [method for method in (BY_APPEARANCE, COLOR_TERM, *imagined) if method in readings]
-    new_R = [thing.color not in SEEN for thing in own.things]
-    for variant, texts, counts_R in (
-        ("original", slice(0, 1), [True, True]),
-        ("variants mean", slice(1, None), [several, several]),
-        ("new names", slice(0, 1), new_R),  # what no training caption named
+    both, several = range(len(ROLES)), len(readings[OURS]) > 1
+    for variant, texts, roles in (
+        ("original", slice(0, 1), both),
+        ("variants mean", slice(1, None), both if several else ()),
+        # what no training caption named
+        ("new names", slice(0, 1), [r for r in both if own.things[r].color not in SEEN]),
     ):
-        ours, misread = readings[OURS][texts], readings[WRONG][texts]
-        for r in np.flatnonzero(counts_R):
-            for method in read:
-                figures[method, variant, METRICS[r]] = [one.most_R[r] for one in readings[method][texts]]
-            if misread and own.things[r] != wrong.things[r]:
-                figures[WRONG, variant, METRICS[r]] = misread[0].most_R[r]
-            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
-            if leads := [one.lead_R[r] for one in ours if np.isfinite(one.lead_R[r])]:
+        chosen = {method: its[texts] for method, its in readings.items() if its[texts]}
+        for r in roles:
+            for method, its in chosen.items():
+                if method != WRONG or own.things[r] != wrong.things[r]:
+                    figures[method, variant, METRICS[r]] = [one.most_R[r] for one in its]
+            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in chosen[OURS]])
+            if leads := [one.lead_R[r] for one in chosen[OURS] if np.isfinite(one.lead_R[r])]:
                 figures[OURS, variant, f"lead_{ROLES[r]}"] = np.mean(leads)
-        if any(counts_R):
-            for method in imagined:
-                figures[method, variant, ENDS] = [one.ends_in_bowl for one in readings[method][texts]]
-            if misread:
-                figures[WRONG, variant, ENDS] = misread[0].ends_in_bowl
-    for method in imagined if several else ():
-        for r, n, h in np.ndindex(readings[OURS][0].most_Rnh.shape):
+        for method in (OURS, NO_COLOR_TERM, WRONG):
+            if roles and method in chosen:
+                figures[method, variant, ENDS] = [one.ends_in_bowl for one in chosen[method]]
+    for method in (OURS, NO_COLOR_TERM):
+        for r, n, h in np.ndindex(readings[method][0].most_Rnh.shape) if several and readings[method] else ():
             name = f"{method}, layer {n + 1} head {h + 1}"
             figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in readings[method]]
     return figures
@@ -296,10 +295,11 @@ def color_term(
 ) -> list[np.ndarray]:
     """What comparing each slot's colour with the lexicon's says by itself, as an attention of one step and head."""
     color_1K3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
-    present_1K = torch.from_numpy(present_K)[None]
-    matches = [color_match(color_1K3, present_1K, model.model.text([text]))[0].numpy() for text in texts]
-    pairs = zip(matches, texts, strict=True)
-    return [merge_tokens(match_KL, model.words(text), text)[None, None, None] for match_KL, text in pairs]
+    present_1K, merged = torch.from_numpy(present_K)[None], []
+    for text in texts:
+        match_1KL = color_match(color_1K3, present_1K, model.model.text([text]))
+        merged.append(merge_tokens(match_1KL.numpy()[None, None], model.words(text), text))
+    return merged
 
 
 @dataclass(frozen=True)
@@ -425,7 +425,7 @@ ENDS_TABLE = TableSpec("The named block ends in the named bowl", columns(ENDS, C
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     here = [one.readings for one in found["scenes"] if one.scene.split == VARIED]
-    methods = [method for method in (OURS, NO_COLOR_TERM) if method in here[0]]
+    methods = [method for method in (OURS, NO_COLOR_TERM) if here[0][method]]
     every = {method: [one for readings in here for one in readings[method]] for method in methods}
     maps_nhGW = mean_known([one.map_nhGW for one in every[OURS]])
     there = [g for g in range(len(GROUPS)) if not np.isnan(maps_nhGW[:, :, g]).any()]

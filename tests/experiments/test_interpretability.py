@@ -117,7 +117,7 @@ def test_who_attends_gets_full_marks_everywhere() -> None:
     assert figures_of("attends", BY_APPEARANCE) == [1.0] * 8
     # Under the wrong sentence other things attend.
     assert not any(figures_of("attends", WRONG))
-    assert not outcome("attends").figures[WRONG, "original", "ends_in_bowl"]
+    assert outcome("attends").figures[WRONG, "original", "ends_in_bowl"] == [False]
 
 
 def test_the_uniform_and_the_confused_get_nothing() -> None:
