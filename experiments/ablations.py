@@ -23,12 +23,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.report.page import CardSpec, Clips, Figure, Section
-from experiments.report.plots import Series, interval_plot
+from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Cell, Column, Line, Table, TableRow, TableSpec
-from experiments.study.clips import PredictionClip, best_and_worst, extreme_clips
+from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.judge import imagine_and_judge
@@ -63,7 +62,6 @@ class AblationRun(Line):
     """One model to train. Its key is the name of its folder, in the folder of all runs."""
 
     stage: str  # what is trained: `parser` with renderer (stage 1), or text encoder and `predictor` (stage 2)
-    group: str  # the part of the table that it belongs to
     preset: str  # where its settings start from
     settings: tuple[str, ...] = ()  # what differs from the preset, each `part.field=value`
 
@@ -72,34 +70,29 @@ class AblationRun(Line):
         """What it must have been trained with."""
         return with_settings(preset(self.preset), self.settings)
 
-    @property
-    def command(self) -> str:
-        """What to type to train it."""
-        return f"python experiments/train_ablations.py --only {self.key}"
-
 
 NO_BIAS, GAUSSIAN = "predictor.color_bias=false", "parser.initializer=gaussian"
-NO_PRIOR, FIRST_SLOTS = "renderer.mask_prior=false", "initializer and decoder"
+NO_PRIOR = "renderer.mask_prior=false"
 # All predictor runs learn from the slots of one parser, from the same episodes in the same order, with as many updates;
 # parser runs likewise. Those with the lexicon also learn from recoloured scenes (`textocvp.data.slot_batches`).
 RUNS = tuple(
     AblationRun(
-        stage=stage, group=group, key=key, label=label, preset=PRESETS[stage], settings=tuple(settings),
+        stage=stage, key=key, label=label, preset=PRESETS[stage], settings=tuple(settings),
         note=", ".join(settings) or "the preset as it is",
     )
-    for stage, group, key, label, *settings in (
-        ("predictor", "reference", "base", "3 layers, residual, lexicon with colour bias"),
-        ("predictor", "depth", "layers-1", "1 layer", "predictor.layers=1"),
-        ("predictor", "depth", "layers-2", "2 layers", "predictor.layers=2"),
-        ("predictor", "depth", "layers-4", "4 layers", "predictor.layers=4"),
-        ("predictor", "residual", "residual-off", "no residual", "predictor.residual=false"),
-        ("predictor", "text", "lexicon-no-bias", "lexicon without colour bias", NO_BIAS),
-        ("predictor", "text", "text-transformer", "transformer from scratch", "text.kind=transformer", NO_BIAS),
-        ("predictor", "text", "text-minilm", "MiniLM, frozen", "text.kind=minilm", NO_BIAS),
-        ("parser", FIRST_SLOTS, "savi-cluster-prior", "clusters, decoder with prior"),
-        ("parser", FIRST_SLOTS, "savi-cluster", "clusters, decoder without prior", NO_PRIOR),
-        ("parser", FIRST_SLOTS, "savi-gaussian-prior", "Gaussian, decoder with prior", GAUSSIAN),
-        ("parser", FIRST_SLOTS, "savi-gaussian", "Gaussian, decoder without prior", GAUSSIAN, NO_PRIOR),
+    for stage, key, label, *settings in (
+        ("predictor", "base", "3 layers, residual, lexicon with colour bias"),
+        ("predictor", "layers-1", "1 layer", "predictor.layers=1"),
+        ("predictor", "layers-2", "2 layers", "predictor.layers=2"),
+        ("predictor", "layers-4", "4 layers", "predictor.layers=4"),
+        ("predictor", "residual-off", "no residual", "predictor.residual=false"),
+        ("predictor", "lexicon-no-bias", "lexicon without colour bias", NO_BIAS),
+        ("predictor", "text-transformer", "transformer from scratch", "text.kind=transformer", NO_BIAS),
+        ("predictor", "text-minilm", "MiniLM, frozen", "text.kind=minilm", NO_BIAS),
+        ("parser", "savi-cluster-prior", "clusters, decoder with prior"),
+        ("parser", "savi-cluster", "clusters, decoder without prior", NO_PRIOR),
+        ("parser", "savi-gaussian-prior", "Gaussian, decoder with prior", GAUSSIAN),
+        ("parser", "savi-gaussian", "Gaussian, decoder without prior", GAUSSIAN, NO_PRIOR),
     )
 )  # fmt: skip
 PREDICTORS, PARSERS = (tuple(run for run in RUNS if run.stage == stage) for stage in PRESETS)
@@ -114,20 +107,22 @@ class FoundRun:
     state: Literal["trained", "not finished", "not trained", "other settings", "not loadable"]
     detail: str = ""  # which other settings, or why it cannot be loaded here
     updates: int | None = None  # how many it had, where that is known
+    sha256: str = ""  # of its weights, first 16 digits, once it has been loaded
 
     @property
-    def entrant(self) -> Entrant:
-        """Its model, as it is measured."""
-        return Entrant(self.run.key, LoadCheckpoint(str(self.folder / "checkpoint")))
+    def checkpoint(self) -> LoadCheckpoint:
+        """Makes its model."""
+        return LoadCheckpoint(str(self.folder / "checkpoint"))
 
     @property
     def line(self) -> Line:
         """Its line of a table, with its updates, or why it is absent and what trains it."""
-        if self.state != "trained":
-            note = f"{self.state}; {self.detail or f'train it: {self.run.command}'}"
-            return replace(self.run, kind="control", note=note)
-        updates = f"; {self.updates} updates" if self.updates else ""
-        return replace(self.run, note=self.run.note + updates)
+        if self.state == "trained":
+            return replace(
+                self.run, note=self.run.note + (f"; {self.updates} updates" if self.updates else "")
+            )
+        why = self.detail or f"train it: python experiments/train_ablations.py --only {self.run.key}"
+        return replace(self.run, kind="control", note=f"{self.state}; {why}")
 
 
 def find_run(run: AblationRun, runs: Path) -> FoundRun:
@@ -158,31 +153,25 @@ def differences(run: AblationRun, config: ModelConfig) -> list[str]:
     ]
 
 
-def look(runs: Path) -> tuple[tuple[FoundRun, ...], dict[str, str]]:
-    """What there is of every run, and the SHA-256 of those that can be measured, first 16 digits.
-
-    A trained run that cannot be loaded here (its text encoder may need a package) is `not loadable`.
-    """
-    found, hashes = [], {}
-    for one in (find_run(run, runs) for run in RUNS):
-        if one.state == "trained":
-            try:
-                hashes[one.run.key] = LoadCheckpoint(str(one.folder / "checkpoint"))().checkpoint.sha256[:16]
-            except (CheckpointError, ImportError, OSError, RuntimeError) as error:
-                one = replace(one, state="not loadable", detail=str(error))
-        found.append(one)
-    return tuple(found), hashes
+def load_run(found: FoundRun) -> FoundRun:
+    """A trained run with the hash of its weights; `not loadable` if its text encoder, say, cannot be had here."""
+    if found.state != "trained":
+        return found
+    try:
+        return replace(found, sha256=found.checkpoint().checkpoint.sha256[:16])
+    except (CheckpointError, ImportError, OSError, RuntimeError) as error:
+        return replace(found, state="not loadable", detail=str(error))
 
 
 def runs_table(found: Iterable[FoundRun], failed: Container[str] = ()) -> Table:
     """What there is of each run; `failed` are the names of those whose training just failed."""
-    made = []
+    rows = []
     for one in found:
         state = "failed" if one.run.key in failed else one.state
         cells = (one.run.stage, state, str(one.updates or ""), one.detail)
-        made.append(TableRow(one.run.key, [Cell(text) for text in cells]))
+        rows.append(TableRow(one.run.key, [Cell(text) for text in cells]))
     caption = "`python experiments/train_ablations.py --only NAME` trains one."
-    return Table("Runs", ["stage", "state", "updates", "detail"], made, caption)
+    return Table("Runs", ["stage", "state", "updates", "detail"], rows, caption)
 
 
 # --- units of work ----------------------------------------------------------------------------------------------------
@@ -258,7 +247,8 @@ class FollowingScene:
         """Imagine and judge, with every model."""
         env = worker.environment(self.scene)
         sampled = sample_scene(env, self.scene, self.variants)
-        ground, scorer = AppearanceGrounder.from_info(sampled.info), None
+        seen_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
+        scorer = None
         if self.measures is not None:
             real_T3HW = _to_tensor(play_expert(env, sampled).frames[: LENGTH + 1])
             scorer = Scorer(real_T3HW, self.measures, upper=False)
@@ -267,9 +257,9 @@ class FollowingScene:
             with warnings.catch_warnings():
                 # That a text encoder has never met a colour's name is what the unseen colours are about.
                 warnings.filterwarnings("ignore", "the text encoder has never met", UserWarning)
-                rollout, ours, wrong = imagine_and_judge(
-                    one.model(worker), sampled.observation["rgb"], ground, sampled.texts, self.seed
-                )
+                model = one.model(worker)
+                parsed = model.parse(seen_1HW3, seed=self.seed, num_slots=one.num_slots)
+                rollout, ours, wrong = imagine_and_judge(model, parsed, ground, sampled.texts, self.seed)
             for metric, good_V in ((ENDS, ours.miss_SV[0] < NEAR), ("predicted_success", ours.success_SV[0])):
                 figures[one.name, "original", metric] = good_V[0]
                 if self.variants:
@@ -302,8 +292,8 @@ class ParsingScene:
             scores = score_masks(labels_of(parsed)[0], played.segmentations, sampled.named_block)
             for metric, curve in (("miou", scores.iou), ("kept", scores.kept), ("ari", scores.ari)):
                 figures[one.name, "true frames", metric] = float(np.nanmean(curve))
-            redrawn = psnr(parsed.frames[0], _to_tensor(played.frames))
-            figures[one.name, "true frames", "psnr"] = float(redrawn.mean())
+            redrawn_T = psnr(parsed.frames[0], _to_tensor(played.frames))
+            figures[one.name, "true frames", "psnr"] = float(redrawn_T.mean())
         return Outcome(self.scene, figures)
 
 
@@ -313,8 +303,8 @@ def _to_tensor(frames_THW3: np.ndarray) -> Tensor:
 
 def entrants(run: Run, stage: str) -> tuple[Entrant, ...]:
     """The shipped model and the trained runs of a stage."""
-    trained = (one.entrant for one in run.prepared[0] if one.state == "trained" and one.run.stage == stage)
-    return (Entrant(SHIPPED), *trained)
+    found = (one for one in run.prepared if one.state == "trained" and one.run.stage == stage)
+    return (Entrant(SHIPPED), *(Entrant(one.run.key, one.checkpoint) for one in found))
 
 
 def slots_name(count: int) -> str:
@@ -328,26 +318,25 @@ def units(run: Run) -> dict[str, Part]:
     predictors, parsers = entrants(run, "predictor"), entrants(run, "parser")
     counts = tuple(Entrant(slots_name(count), None, count) for count in sizes.slot_counts)
     varied = study_scenes("controllability", max(sizes.following, sizes.acted), seed)
+    unseen = study_scenes("unseen_colors", sizes.unseen, seed)
     counted = [scene for split in OBJECTS.values() for scene in study_scenes(split, sizes.slots, seed)]
     players = [("random candidate", None), ("expert", None), *(("ours", one.load) for one in predictors)]
     following = [
         FollowingScene(s, predictors, VARIANTS, seed, run.measures) for s in varied[: sizes.following]
     ]
-    following += [
-        FollowingScene(s, predictors, 0, seed) for s in study_scenes("unseen_colors", sizes.unseen, seed)
-    ]
+    following += [FollowingScene(s, predictors, 0, seed) for s in unseen]
     acting = [
         LoopEpisode(who, s, 0, VARIANTS, seed, load) for s in varied[: sizes.acted] for who, load in players
     ]
     parsed = [ParsingScene(s, parsers, seed) for s in study_scenes("test", sizes.parsing, seed)]
+    few_and_many = [ParsingScene(s, counts, seed) for s in counted]
+    imagined = [FollowingScene(s, counts, 0, seed) for s in counted]
     return {
         "predictors": Part(following, 0.6 * len(predictors)),
         "closed loop": Part(acting, 2.0),
         "parsers": Part(parsed, 1.0 * len(parsers)),
-        "slot counts, parsed": Part([ParsingScene(s, counts, seed) for s in counted], 0.5 * len(counts)),
-        "slot counts, imagined": Part(
-            [FollowingScene(s, counts, 0, seed) for s in counted], 0.2 * len(counts)
-        ),
+        "slot counts, parsed": Part(few_and_many, 0.5 * len(counts)),
+        "slot counts, imagined": Part(imagined, 0.2 * len(counts)),
         "pictures": Part(seconds=6.0, count=2 * min(sizes.clips, sizes.following // 2)),
     }
 
@@ -358,14 +347,14 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     shown = tuple(
         Model(e.name, e.load, True, e.name, "", None) for e in trained if e.load and e.name in SHOWN
     )
-    outcomes = [one for one in found["predictors"] if one.scene.split == "controllability" and trained]
-    reached = [sum(bool(one.figures[e.name, "original", ENDS]) for e in trained) for one in outcomes]
-    captions = [f"{n} of {len(trained)} runs end in the bowl" for n in reached]
-    clips = [
-        PredictionClip(one.scene, shown, run.args.seed, "ablations", caption)
-        for one, caption in zip(outcomes, captions, strict=True)
-    ]
-    return {"pictures": extreme_clips(clips, [-float(n) for n in reached], run.sizes.clips)}
+    clips, missed = [], []
+    for one in found["predictors"] if trained else ():
+        if one.scene.split == "controllability":
+            reached = sum(bool(one.figures[e.name, "original", ENDS]) for e in trained)
+            caption = f"{reached} of {len(trained)} runs end in the bowl"
+            clips.append(PredictionClip(one.scene, shown, run.args.seed, "ablations", caption))
+            missed.append(-float(reached))
+    return {"pictures": extreme_clips(clips, missed, run.sizes.clips)}
 
 
 def rows(run: Run, found: Found) -> list[Row]:
@@ -420,120 +409,64 @@ SLOTS = {
     )
     for objects, split in OBJECTS.items()
 }
-GROUPS = {"depth": "Depth", "residual": "Residual connection", "text": "Text encoder"}
+STRICT = Column("other bowls, strict", "controllability", "variants mean", "predicted_success")
+ALIKE = [
+    Column(f"{label} {LENGTH}", "controllability", PICTURES, metric, 1 if metric == "psnr" else 3)
+    for metric, label in METRICS.items()
+]
 
 
-def predictor_table(title: str, runs: Iterable[Line]) -> TableSpec:
-    """Runs of stage 2, between the shipped model and who acts without a model."""
-    strict = Column("other bowls, strict", "controllability", "variants mean", "predicted_success")
-    pictures = [
-        Column(f"{label} {LENGTH}", "controllability", PICTURES, metric, 1 if metric == "psnr" else 3)
-        for metric, label in METRICS.items()
+def tables(runs: Iterable[Line], parsers: Iterable[Line], counts: Iterable[int]) -> list[TableSpec]:
+    """One for the runs of each stage, with what to compare them with, and one for the numbers of slots."""
+    shipped = Line(key=SHIPPED, kind="ceiling", note="the checkpoint that is given: trained for longer")
+    counted = [Line(key=slots_name(count), label=f"{count} slots") for count in counts]
+    compared = [shipped, *runs, *lines(("random candidate", "expert"))]
+    return [
+        TableSpec("Predictor and text encoder", [*FOLLOWING.values(), STRICT, *ALIKE], compared),
+        TableSpec("First slots and decoder", list(PARSING.values()), [shipped, *parsers]),
+        TableSpec("Slots at test time", list(SLOTS.values()), counted),
     ]
-    note = "the checkpoint that the study is given, by default the one in this package: trained several times as long"
-    shipped = Line(key=SHIPPED, kind="ceiling", note=note)
-    made = [shipped, *runs, *lines(("random candidate", "expert"))]
-    return TableSpec(title, [*FOLLOWING.values(), strict, *pictures], made)
-
-
-def parser_table(runs: Iterable[Line]) -> TableSpec:
-    """Runs of stage 1, below the shipped parser."""
-    note = "clusters, slots with explicit place, glimpse decoder; trained longer"
-    shipped = Line(key=SHIPPED, kind="ceiling", note=note)
-    return TableSpec("First slots and decoder", list(PARSING.values()), [shipped, *runs])
-
-
-def slots_table(counts: Iterable[int]) -> TableSpec:
-    """The shipped model with more and fewer slots than it was trained with."""
-    made = [Line(key=slots_name(count), label=f"{count} slots") for count in counts]
-    return TableSpec("Slots at test time", list(SLOTS.values()), made)
-
-
-def plot_lines(name: str, spec: TableSpec, rows: Sequence[Row], label: str) -> Figure:
-    """The figures of a table as a plot: a group for each line, a series for each column."""
-    points = [spec.points(rows, line) for line in spec.lines]
-    series = [Series(column.title, [its[i] for its in points]) for i, column in enumerate(spec.columns)]
-    caption = "Dots with 95 % intervals over scenes."
-    return interval_plot(name, [line.name for line in spec.lines], series, label=label, caption=caption)
-
-
-def following_plot(rows: Sequence[Row], found: Iterable[FoundRun]) -> list[Figure]:
-    """Where the block ends, for every trained predictor; nothing where there is none."""
-    runs = [Line(key=o.run.key) for o in found if o.run.stage == "predictor" and o.state == "trained"]
-    spec = TableSpec("", [column for column in FOLLOWING.values() if column.metric == ENDS], runs)
-    return [plot_lines("following.png", spec, rows, "block ends in the bowl")] if runs else []
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    runs, figures = run.prepared[0], results.rows
-    predictors = [one for one in runs if one.run.stage == "predictor"]
-    updates = sorted({one.updates for one in predictors if one.updates})
-    after = f" of {', '.join(map(str, updates))} updates" if updates else ""
-    intro = (
-        f"{sum(one.state == 'trained' for one in runs)} of {len(runs)} runs are trained. All predictors{after} learned "
-        "from the slots of the shipped parser, from the same episodes in the same order. So compare rows within a "
-        "table, and not with the shipped model, which was trained longer. Measured on test scenes that no training has "
-        f"seen. Does the block end within {NEAR:g} px of the named bowl, with the original instruction and with three "
-        "that name another bowl; judged for another instruction than it was given (wrong text: must be near 0); with "
-        "caption colours never named in training? Strict: the calibrated criterion of the controllability study, for "
-        "which the arm must also carry the block and the block lie still; short trainings seldom pass it. Carried out: "
-        "a robot that plans with that predictor, judged by the simulator; at most three attempts. And how alike are 9 "
-        "imagined frames to the real ones? Runs with the lexicon also learn from scenes whose colour channels are "
-        "permuted together with their words, which other text encoders cannot."
+    trained = sum(one.state == "trained" for one in run.prepared)
+    predictors, parsers = ([one.line for one in run.prepared if one.run.stage == stage] for stage in PRESETS)
+    following, parsing, slots = tables(predictors, parsers, run.sizes.slot_counts)
+    shown = (
+        "Where most runs reach the bowl (best), and where fewest do (worst). Pictures above masks, one colour a thing; "
+        "named are the shipped model (ours) and one run of each kind."
     )
-    tables = [
-        predictor_table(title, [one.line for one in predictors if one.run.group in ("reference", group)])
-        for group, title in GROUPS.items()
-    ]
-    clips = zip(
-        ("where most runs reach the bowl", "where fewest do"), best_and_worst(found["pictures"]), strict=True
-    )
-    shown = "Pictures above masks, one colour a thing; named are the shipped model (ours) and one run of each kind."
-    slots = slots_table(run.sizes.slot_counts)
-    overlap = replace(slots, columns=slots.columns[: len(OBJECTS)])
     return [
         Section(
             "Predictor and text encoder",
-            f"{intro} {run.measures.absent}",
-            [*(table.table(figures) for table in tables), *following_plot(figures, runs)],
+            f"{trained} of {len(run.prepared)} runs are trained. All predictors learned from the slots of the shipped "
+            "parser, from the same episodes in the same order, so compare them with each other, and not with the "
+            "shipped model. Measured on test scenes that no training has seen. Does the block end within "
+            f"{NEAR:g} px of the named bowl, with the original instruction and with three that name another bowl; "
+            "judged for another instruction than it was given (wrong text: must be near 0); with caption colours never "
+            "named in training? Strict: the calibrated criterion of the controllability study, for which the arm must "
+            "also carry the block and the block lie still. Carried out: a robot that plans with that predictor, judged "
+            f"by the simulator; at most three attempts. And how alike are {LENGTH} imagined frames to the real ones? "
+            "Runs with the lexicon also learn from scenes whose colour channels are permuted together with their "
+            f"words, which other text encoders cannot. {run.measures.absent}",
+            [following.table(results.rows)],
         ),
-        *(Section(f"Imagined beside real, {title}", shown, [Clips(its)]) for title, its in clips if its),
+        *([Section("Imagined beside real", shown, [Clips(found["pictures"])])] if found["pictures"] else []),
         Section(
             "First slots and decoder",
             "Parsers on the expert's whole episodes of the test split. mIoU: of blocks and bowls, slots matched afresh "
             "in every frame. Kept slot: each thing held against the slot that had it in the first frame. The runs "
             "below the shipped parser have the published corrector. They differ in how slots start (clusters of colour "
             "and place, or samples of a learned Gaussian) and in whether the decoder knows a slot's place beforehand.",
-            [parser_table(one.line for one in runs if one.run.stage == "parser").table(figures)],
+            [parsing.table(results.rows)],
         ),
         Section(
             "More and fewer slots than in training",
             "The number of slots is free at test time. The background takes one and the arm at least one, so 6 objects "
             "need 8 slots and 8 objects 10.",
-            [slots.table(figures), plot_lines("slots.png", overlap, figures, "mIoU")],
+            [slots.table(results.rows)],
         ),
-    ]
-
-
-def cards(run: Run, results: Results) -> list[CardSpec]:
-    """What the choices are worth that matter most."""
-    bowls, unseen, overlap = FOLLOWING["variants_mean"], FOLLOWING["unseen_colors"], PARSING["miou"]
-    others, never, published = "three other bowls", "never named in training", "published corrector"
-    wanted = (
-        ("Reference: three other bowls", "base", bowls, "3 layers"),
-        ("One layer", "layers-1", bowls, others),
-        ("No residual", "residual-off", bowls, others),
-        ("No colour bias", "lexicon-no-bias", bowls, others),
-        ("Unseen colours, colour bias", "base", unseen, never),
-        ("Unseen colours, plain transformer", "text-transformer", unseen, never),
-        ("mIoU, clusters", "savi-cluster-prior", overlap, published),
-        ("mIoU, Gaussian", "savi-gaussian-prior", overlap, published),
-    )
-    measured = {one.run.key for one in run.prepared[0] if one.state == "trained"}
-    return [
-        CardSpec(label, Line(key=key), column, compare if key in measured else "not trained")
-        for label, key, column, compare in wanted
     ]
 
 
@@ -544,26 +477,32 @@ STUDY = Study(
     args=Args,
     sizes=lambda args: QUICK if args.quick else DEFAULT,
     horizon=HORIZON,
-    prepare=lambda run: look(cast(Args, run.args).runs),
-    inputs=lambda args: sorted(path for path in args.runs.glob("*/*/*") if path.name in (CONFIG_FILE, WEIGHTS_FILE)),
-    versions=lambda run: {f"run {name}": sha256 for name, sha256 in run.prepared[1].items()},
+    prepare=lambda run: [load_run(find_run(one, cast(Args, run.args).runs)) for one in RUNS],
+    inputs=lambda args: sorted(p for p in args.runs.glob("*/*/*") if p.name in (CONFIG_FILE, WEIGHTS_FILE)),
+    versions=lambda run: {f"run {one.run.key}": one.sha256 for one in run.prepared if one.sha256},
     measures=lambda args: available_measures(),
     units=units,
     cases=cases,
     rows=rows,
-    tables=[
-        predictor_table("Predictors", PREDICTORS),
-        parser_table(PARSERS),
-        slots_table(SLOT_COUNTS),
-    ],
-    printed=lambda run, results: [runs_table(run.prepared[0])],
+    tables=tables(PREDICTORS, PARSERS, SLOT_COUNTS),
+    printed=lambda run, results: [runs_table(run.prepared)],
     page=page,
-    cards=cards,
+    cards=[
+        CardSpec(label, Line(key=key), column, compare)
+        for label, key, column, compare in (
+            ("Reference: three other bowls", "base", FOLLOWING["variants_mean"], "3 layers"),
+            ("One layer", "layers-1", FOLLOWING["variants_mean"], "three other bowls"),
+            ("No residual", "residual-off", FOLLOWING["variants_mean"], "three other bowls"),
+            ("No colour bias", "lexicon-no-bias", FOLLOWING["variants_mean"], "three other bowls"),
+            ("Unseen colours, colour bias", "base", FOLLOWING["unseen_colors"], "never named"),
+            ("Unseen colours, transformer", "text-transformer", FOLLOWING["unseen_colors"], "never named"),
+            ("mIoU, clusters", "savi-cluster-prior", PARSING["miou"], "published corrector"),
+            ("mIoU, Gaussian", "savi-gaussian-prior", PARSING["miou"], "published corrector"),
+        )
+    ],
     headline=headline,
-    first=(
-        "base_variants_mean", "layers_1_variants_mean", "residual_off_variants_mean", "lexicon_no_bias_variants_mean",
-    ),
-)  # fmt: skip
+    first=[f"{run}_variants_mean" for run in ("base", "layers_1", "residual_off", "lexicon_no_bias")],
+)
 
 if __name__ == "__main__":
     start(STUDY)

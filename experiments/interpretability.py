@@ -14,6 +14,7 @@ because that term alone could decide. Writes `results.json`, `report.html`, plot
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -24,10 +25,10 @@ import torch
 from envs.colors import SEEN
 from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Figure, Section
-from experiments.report.plots import curve_plot, heat_grid, heat_map, plot_table
+from experiments.report.plots import curve_plot, heat_grid, heat_map
 from experiments.report.results import Results
-from experiments.report.rows import Key, Row, figure_rows
-from experiments.report.tables import Column, Line, Table, TableSpec, columns
+from experiments.report.rows import Key, figure_rows
+from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import tone
 from experiments.study.judge import find_things
 from experiments.study.methods import HORIZON
@@ -74,11 +75,8 @@ class Sizes:
 
 # --- reading attention ------------------------------------------------------------------------------------------------
 
-
-def words_of(text: str) -> tuple[str, ...]:
-    """`TEMPLATE` with the colours of an instruction."""
-    block, bowl = Instruction.parse(text).things
-    return ("put", "the", block.color, "block", "in", "the", bowl.color, "bowl")
+NO_LETTERS = re.compile(r"^<.*>$|^\[.*\]$|^(\u2581|##|\u0120)|\s")
+"""What spells nothing: special tokens as </s> and [CLS], and how tokenizers mark where a word begins or goes on."""
 
 
 def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.ndarray:
@@ -89,22 +87,17 @@ def merge_tokens(values: np.ndarray, tokens: Sequence[str], text: str) -> np.nda
     Raises:
         UsageError: if the tokens do not spell the words of the text.
     """
-    words, spelled = [word.replace(" ", "") for word in words_of(text)], [""]
+    block, bowl = (thing.color.replace(" ", "") for thing in Instruction.parse(text).things)
+    words = ("put", "the", block, "block", "in", "the", bowl, "bowl")
+    spelled = [NO_LETTERS.sub("", token).lower() for token in tokens]
     merged = np.zeros((*values.shape[:-1], len(words)), dtype=values.dtype)
-    for column, token in enumerate(tokens):
-        letters = token.lower().replace(" ", "")
-        for mark in ("\u2581", "##", "\u0120"):  # how tokenizers mark the begin of a word, or its going on
-            letters = letters.removeprefix(mark)
-        if not letters or (token[0], token[-1]) in (("<", ">"), ("[", "]")):  # as in </s> and [CLS]
-            continue
-        if spelled[-1] == words[len(spelled) - 1]:
-            spelled.append("")
-        spelled[-1] += letters
-        if len(spelled) > len(words) or not words[len(spelled) - 1].startswith(spelled[-1]):
-            break
-        merged[..., len(spelled) - 1] += values[..., column]
-    if spelled != words:
+    ends, letters = np.cumsum([len(word) for word in words]), 0
+    if "".join(spelled) != "".join(words):
         raise UsageError(f"the tokens {list(tokens)} do not spell the words of {text!r}")
+    for column, token in enumerate(spelled):
+        if token:
+            merged[..., np.searchsorted(ends, letters, side="right")] += values[..., column]
+        letters += len(token)
     return merged
 
 
@@ -121,7 +114,7 @@ class AttentionReading:
     most_Rnh: np.ndarray  # the same for each layer and head, by means over T
     most_RT: np.ndarray  # the same for each step, by means over n and h
     chance_R: np.ndarray  # the thing's share of the present slots
-    margin_R: np.ndarray  # how far its share is above the largest of all others (negative: below), or nan
+    lead_R: np.ndarray  # how far its share is above the largest of all others; -inf without a slot
     shares_RTG: np.ndarray  # each group's mean share for the role's colour word; nan without such a thing
     map_nhGW: np.ndarray  # each group's mean shares over T
     ends_in_bowl: bool  # whether the named block's slot ends near where the named bowl's slot was
@@ -148,7 +141,7 @@ def read_attention(
         most_Rnh=leads(0) > 0,
         most_RT=leads(1, 2) > 0,
         chance_R=np.array([present_K[slots].sum() / present_K.sum() for slots in slots_R]),
-        margin_R=np.where(np.isfinite(lead_R), lead_R, np.nan),
+        lead_R=lead_R,
         shares_RTG=np.array([_group_means(shares.mean((1, 2)), groups) for shares in shares_R]),
         map_nhGW=_group_means(attention_TnhKW.mean(0).swapaxes(-1, -2), groups).swapaxes(-1, -2),
         ends_in_bowl=ends,
@@ -207,8 +200,8 @@ class AttentionOutcome:
     """What was read of a scene with V texts: its own instruction and its variants."""
 
     scene: StudyScene
-    # method -> what was read, V readings, but one of `WRONG`. Slots are named by the simulator's segmentation of the
-    # first frame, for measuring only, except for `BY_APPEARANCE`.
+    # method -> what was read: V readings, one of `WRONG`, none of what the model does not have. Slots are named by the
+    # simulator's segmentation of the first frame, for measuring only, except for `BY_APPEARANCE`.
     readings: Mapping[str, Sequence[AttentionReading]]
     figures: Mapping[tuple[str, str, str], Any]  # see `figure_rows`
 
@@ -243,10 +236,14 @@ class AttentionScene:
 
         attention, rollout = imagine(model, parsed, [*texts, wrong], self.seed)
         *ours, misread = read(attention, rollout)
-        readings = {BY_APPEARANCE: read(attention[:-1], rollout, seen), OURS: ours, WRONG: [misread]}
-        if (without := without_color_term(model)) is not None:
-            readings[COLOR_TERM] = read(color_term(model, parsed, texts, present_K), rollout)
-            readings[NO_COLOR_TERM] = read(*imagine(without, parsed, texts, self.seed))
+        without = without_color_term(model)
+        readings = {
+            BY_APPEARANCE: read(attention[:-1], rollout, seen),
+            COLOR_TERM: read(color_term(model, parsed, texts, present_K), rollout) if without else [],
+            OURS: ours,
+            NO_COLOR_TERM: read(*imagine(without, parsed, texts, self.seed)) if without else [],
+            WRONG: [misread],
+        }
         figures = scene_figures(asked[0], Instruction.parse(wrong), readings)
         return AttentionOutcome(self.scene, readings, figures)
 
@@ -256,32 +253,26 @@ def scene_figures(
 ) -> dict[tuple[str, str, str], Any]:
     """Figures of a scene, of its own instruction and the wrong one; see `AttentionOutcome`."""
     figures: dict[tuple[str, str, str], Any] = {}
-    several = len(readings[OURS]) > 1
-    imagined = [method for method in (OURS, NO_COLOR_TERM) if method in readings]
-    read = [method for method in (BY_APPEARANCE, COLOR_TERM, *imagined) if method in readings]
-    new_R = [thing.color not in SEEN for thing in own.things]
-    for variant, texts, counts_R in (
-        ("original", slice(0, 1), [True, True]),
-        ("variants mean", slice(1, None), [several, several]),
-        ("new names", slice(0, 1), new_R),  # what no training caption named
+    both, several = range(len(ROLES)), len(readings[OURS]) > 1
+    for variant, texts, roles in (
+        ("original", slice(0, 1), both),
+        ("variants mean", slice(1, None), both if several else ()),
+        # what no training caption named
+        ("new names", slice(0, 1), [r for r in both if own.things[r].color not in SEEN]),
     ):
-        ours, misread = readings[OURS][texts], readings[WRONG][texts]
-        for r in np.flatnonzero(counts_R):
-            for method in read:
-                figures[method, variant, METRICS[r]] = [one.most_R[r] for one in readings[method][texts]]
-            if misread and own.things[r] != wrong.things[r]:
-                figures[WRONG, variant, METRICS[r]] = misread[0].most_R[r]
-            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in ours])
-            margins = [one.margin_R[r] for one in ours]
-            if not np.isnan(margins).all():
-                figures[OURS, variant, f"lead_{ROLES[r]}"] = np.nanmean(margins)
-        if any(counts_R):
-            for method in imagined:
-                figures[method, variant, ENDS] = [one.ends_in_bowl for one in readings[method][texts]]
-            if misread:
-                figures[WRONG, variant, ENDS] = misread[0].ends_in_bowl
-    for method in imagined if several else ():
-        for r, n, h in np.ndindex(readings[OURS][0].most_Rnh.shape):
+        chosen = {method: its[texts] for method, its in readings.items() if its[texts]}
+        for r in roles:
+            for method, its in chosen.items():
+                if method != WRONG or own.things[r] != wrong.things[r]:
+                    figures[method, variant, METRICS[r]] = [one.most_R[r] for one in its]
+            figures[CHANCE, variant, METRICS[r]] = np.mean([one.chance_R[r] for one in chosen[OURS]])
+            if leads := [one.lead_R[r] for one in chosen[OURS] if np.isfinite(one.lead_R[r])]:
+                figures[OURS, variant, f"lead_{ROLES[r]}"] = np.mean(leads)
+        for method in (OURS, NO_COLOR_TERM, WRONG):
+            if roles and method in chosen:
+                figures[method, variant, ENDS] = [one.ends_in_bowl for one in chosen[method]]
+    for method in (OURS, NO_COLOR_TERM):
+        for r, n, h in np.ndindex(readings[method][0].most_Rnh.shape) if several and readings[method] else ():
             name = f"{method}, layer {n + 1} head {h + 1}"
             figures[name, "all", METRICS[r]] = [one.most_Rnh[r, n, h] for one in readings[method]]
     return figures
@@ -290,15 +281,10 @@ def scene_figures(
 def imagine(
     model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int
 ) -> tuple[list[np.ndarray], Rollout]:
-    """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`.
-
-    Raises:
-        UsageError: if the model reads no text.
-    """
+    """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`."""
     horizon = min(HORIZON, model.longest_horizon or HORIZON)
     rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
-    if rollout.attention is None:
-        raise UsageError(f"{model.checkpoint.name} keeps no attention from slots to words: it reads no text")
+    assert rollout.attention is not None  # `check_model` saw to it
     pairs = zip(rollout.attention.double().cpu().numpy(), texts, strict=True)
     return [merge_tokens(attention, model.words(text), text) for attention, text in pairs], rollout
 
@@ -309,10 +295,11 @@ def color_term(
 ) -> list[np.ndarray]:
     """What comparing each slot's colour with the lexicon's says by itself, as an attention of one step and head."""
     color_1K3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
-    present_1K = torch.from_numpy(present_K)[None]
-    matches = [color_match(color_1K3, present_1K, model.model.text([text]))[0].numpy() for text in texts]
-    pairs = zip(matches, texts, strict=True)
-    return [merge_tokens(match_KL, model.words(text), text)[None, None, None] for match_KL, text in pairs]
+    present_1K, merged = torch.from_numpy(present_K)[None], []
+    for text in texts:
+        match_1KL = color_match(color_1K3, present_1K, model.model.text([text]))
+        merged.append(merge_tokens(match_1KL.numpy()[None, None], model.words(text), text))
+    return merged
 
 
 @dataclass(frozen=True)
@@ -323,22 +310,13 @@ class AttentionPicture:
     variants: int  # see `AttentionScene`
     seed: int
     variant: int  # which of its texts
-    reading: AttentionReading
+    lead: float  # what it is chosen for: the smaller one of the two things, -inf if one has no slot
+    success: bool  # whether both named things attend most to their colour words
     best: bool = True
     rank: int = 1  # its place among the best or the worst
 
-    @property
-    def margin(self) -> float:
-        """What it is chosen for: the smaller of the two leads. A thing without a slot is the worst case there is."""
-        return float(np.nan_to_num(self.reading.margin_R, nan=-np.inf).min())
-
-    @property
-    def success(self) -> bool:
-        """Whether both named things attend most to their colour words."""
-        return bool(self.reading.most_R.all())
-
-    def run(self, worker: Worker) -> tuple[Clip, Figure | None]:
-        """Imagine it once more, and paint: a clip, and for the first of each kind a map of slots and words."""
+    def run(self, worker: Worker) -> Clip:
+        """Imagine it once more, and paint."""
         sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
         parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=self.seed)
         text, kind = sampled.texts[self.variant], "best" if self.best else "worst"
@@ -346,24 +324,16 @@ class AttentionPicture:
         frames_THW3, masks_TKHW = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
         shares_TKW = attention_TnhKW.mean((1, 2))
         glowing = [glow(frames_THW3, masks_TKHW, shares_TKW[..., word]) for word in COLOR_WORDS]
-        figure = f"lead {self.margin:.3f}" if np.isfinite(self.margin) else "a named thing has no slot"
-        things = Instruction.parse(text).things
-        clip = Clip(
+        figure = f"lead {self.lead:.3f}" if np.isfinite(self.lead) else "a named thing has no slot"
+        return Clip(
             name=f"attention-{kind}-{self.rank}.gif",
             gif=gif([[frames_THW3, *glowing]]),
-            panels=("imagined", *(f'"{thing.color}"' for thing in things)),
+            panels=("imagined", *(f'"{thing.color}"' for thing in Instruction.parse(text).things)),
             title=text,
             caption=f"{self.scene.split.replace('_', ' ')}, seed {self.scene.seed}; {figure}",
             badge=f"{kind} {self.rank}: {'both attend most' if self.success else 'missed'}",
             tone=tone(self.success),
         )
-        if self.rank > 1:
-            return clip, None
-        groups, caption = (
-            [*map(str, things), *GROUPS[2:]],
-            f"The {kind} case: mean share over steps, layers and heads.",
-        )
-        return clip, word_map(f"words-{kind}.png", [self.reading], caption, groups, words_of(text))
 
 
 def glow(frames_THW3: np.ndarray, masks_TKHW: np.ndarray, shares_SK: np.ndarray) -> np.ndarray:
@@ -403,14 +373,14 @@ def units(run: Run) -> dict[str, Part]:
 def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -> list[AttentionPicture]:
     """The cases with the largest and the smallest lead of the named things, each of another scene."""
     every = [
-        AttentionPicture(outcome.scene, len(outcome.readings[OURS]) - 1, seed, v, reading)
-        for outcome in outcomes
-        for v, reading in enumerate(outcome.readings[OURS])
-    ]
+        AttentionPicture(o.scene, len(o.readings[OURS]) - 1, seed, v, float(one.lead_R.min()), bool(one.most_R.all()))
+        for o in outcomes
+        for v, one in enumerate(o.readings[OURS])
+    ]  # fmt: skip
     chosen = []
     for best in (True, False):
         firsts: dict[int, AttentionPicture] = {}
-        for case in sorted(every, key=lambda case: case.margin, reverse=best):
+        for case in sorted(every, key=lambda case: case.lead, reverse=best):
             firsts.setdefault(case.scene.seed, case)
         ranked = enumerate(list(firsts.values())[:count], start=1)
         chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
@@ -435,11 +405,11 @@ LINES = {
     line.key: line
     for line in (
         Line(key=OURS, note="slots named by the simulator's segmentation, for measuring only"),
-        Line(key=BY_APPEARANCE, hue=1, note="slots named by their appearance, as the planner does it"),
-        Line(key=NO_COLOR_TERM, kind="control", hue=3, note="the same weights without the term that compares colours"),
+        Line(key=BY_APPEARANCE, note="slots named by their appearance, as the planner does it"),
+        Line(key=NO_COLOR_TERM, kind="control", note="the same weights without the term that compares colours"),
         Line(key=COLOR_TERM, kind="control", note="that term alone: whose colour is nearest to the word's, no network"),
-        Line(key=WRONG, kind="control", hue=4, note="under a sentence that names other things: should be near 0"),
-        Line(key=CHANCE, kind="control", hue=2, note="one guess among the slots that are present"),
+        Line(key=WRONG, kind="control", note="under a sentence that names other things: should be near 0"),
+        Line(key=CHANCE, kind="control", note="one guess among the slots that are present"),
     )
 }  # fmt: skip
 ATTENDS_TABLES = [
@@ -448,153 +418,104 @@ ATTENDS_TABLES = [
     )
     for role, metric in zip(ROLES, METRICS, strict=True)
 ]
-ENDS_TABLE = TableSpec(
-    "The named block ends in the named bowl",
-    columns(ENDS, COLUMNS),
-    [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)],
-)
+ENDS_LINES = [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)]
+ENDS_TABLE = TableSpec("The named block ends in the named bowl", columns(ENDS, COLUMNS), ENDS_LINES)
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    rows, here = list(results.rows), [one for one in found["scenes"] if one.scene.split == VARIED]
-    readings = {
-        method: [one for o in here for one in o.readings[method]]
-        for method in (OURS, NO_COLOR_TERM)
-        if method in here[0].readings
-    }
-    ours = readings[OURS]
-    # A scene's texts are not independent: one curve a scene.
-    shares_NRTG = np.array([_nanmean([one.shares_RTG for one in o.readings[OURS]]) for o in here])
-    most_NRT = np.array([np.mean([one.most_RT for one in o.readings[OURS]], axis=0) for o in here])
-    dotted = [line for line in LINES.values() if line.key != COLOR_TERM]
-    dots, curves = [], []
-    for r, (role, table) in enumerate(zip(ROLES, ATTENDS_TABLES, strict=True)):
-        label = f"named {role} attends most"
-        dots.append(plot_table(f"{METRICS[r]}.png", table, rows, label=label, lines=dotted))
-        shares = {group: shares_NRTG[:, r, :, g] for g, group in enumerate(GROUPS)}
-        caption = "Mean over scenes with its 95 % interval."
-        curves.append(plot_curves(f"shares_{role}.png", shares, f"share for the {role}'s colour", caption))
-    most = {f"named {role}": most_NRT[:, r] for r, role in enumerate(ROLES)}
-    caption = "Share of instructions in which the named thing attends most to its colour word, step by step."
-    chance = (float(np.mean([one.chance_R for one in ours])), "chance")
-    curves.append(plot_curves("most.png", most, "attends most", caption, [chance]))
-    mean_over = "Mean over scenes, instructions, steps, layers and heads"
-    maps_nhGW, groups = group_maps(ours, GROUPS)
-    layers = [f"layer {n + 1}" for n in range(maps_nhGW.shape[0])]
+    here = [one.readings for one in found["scenes"] if one.scene.split == VARIED]
+    methods = [method for method in (OURS, NO_COLOR_TERM) if here[0][method]]
+    every = {method: [one for readings in here for one in readings[method]] for method in methods}
+    maps_nhGW = mean_known([one.map_nhGW for one in every[OURS]])
+    there = [g for g in range(len(GROUPS)) if not np.isnan(maps_nhGW[:, :, g]).any()]
+    groups, maps_nhGW = [GROUPS[g] for g in there], maps_nhGW[:, :, there]
+    layers = [f"layer {n + 1}" for n in range(len(maps_nhGW))]
     heads = [f"head {h + 1}" for h in range(maps_nhGW.shape[1])]
-    titles = [[f"{layer}, {head}" for head in heads] for layer in layers]
-    by_head = []
-    for method, ending, of in ((OURS, "", ""), (NO_COLOR_TERM, "_no_colour_term", f", {NO_COLOR_TERM}")):
-        for r, role in enumerate(ROLES if method in readings else ()):
-            most_nh = np.mean([one.most_Rnh[r] for one in readings[method]], axis=0)
-            caption = f"How often the named {role} attends most to its colour word{of}."
-            name = f"heads_{role}{ending}.png"
-            by_head.append(
-                heat_map(name, most_nh, layers, heads, label="attends most", top=1.0, caption=caption)
-            )
-    together = "The same for each layer and head. All maps share one scale."
+    by_head = [
+        heat_map(f"heads_{role}{ending}.png", np.mean([one.most_Rnh[r] for one in every[method]], axis=0), layers,
+                 heads, label="attends most", top=1.0, caption=f"{method}: the named {role} and its colour word.")
+        for method, ending in zip(methods, ("", "_no_colour_term"), strict=False)
+        for r, role in enumerate(ROLES)
+    ]  # fmt: skip
     sections = [
         Section(
             "How often does the named thing attend most?",
-            "Every slot divides its attention among the words: its shares sum to 1, less what a text encoder's special "
-            "tokens get. A slot attends most to a word if its share for that word is larger than that of every "
-            "other slot that is present, table included; equal is not more. Shares are averaged over steps, layers and "
-            "heads first. A colour is one word, whatever the encoder makes of it. A named thing that the parser gave "
-            "no slot counts as a miss. New names: the scenes with unseen colours in which the thing's colour name is "
-            "in no training caption.",
-            [*(measured(table, rows) for table in ATTENDS_TABLES), *dots],
+            "Every slot divides its attention among the words: its shares sum to 1, less what special tokens get. It "
+            "attends most to a word if its share for that word is larger than that of every other present slot, table "
+            "included. Shares are averaged over steps, layers and heads first. A named thing without a slot counts as "
+            "a miss. New names: the scenes in which the thing's colour name is in no training caption.",
+            [table.table(results.rows) for table in ATTENDS_TABLES],
         ),
         Section(
-            "Head by head",
-            "The same figure for each layer and head by itself, over all instructions of these scenes.",
-            by_head,
-        ),
-        Section(
-            "What each thing attends to",
-            "Mean share of each thing's slots for each word: over all heads, and head by head.",
+            "Head by head, and what each thing attends to",
+            "The same figure for each layer and head by itself, over all instructions of the scenes with 4 bowls. And "
+            "the mean share of each thing's slots for each word, over scenes, instructions and steps.",
             [
-                word_map("attention.png", ours, f"{mean_over} (all heads)."),
-                heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE, titles,
-                          label="attention to words", caption=together),
-                *(words for _, words in found["pictures"] if words),
+                *by_head,
+                heat_map("attention.png", maps_nhGW.mean((0, 1)), groups, SHORT_WORDS,
+                         label="attention to words", caption="Mean over layers and heads."),
+                heat_grid("attention_heads.png", maps_nhGW, groups, TEMPLATE,
+                          [[f"{layer}, {head}" for head in heads] for layer in layers],
+                          label="attention to words", caption="Head by head. All maps share one scale."),
             ],
         ),
         Section(
             "Over time",
-            "Shares for the two colour words while the arm reaches, carries and retreats; mean over layers and heads.",
-            curves,
+            "For the two colour words while the arm reaches, carries and retreats; mean over layers and heads. Bands "
+            "are 95 % intervals over scenes.",
+            curves([readings[OURS] for readings in here]),
         ),
         Section(
             "Seen over the picture",
             "The cases in which the named things lead the most and the least. Each slot glows with its share of "
             "attention to the block's colour word and to the bowl's.",
-            [Clips([clip for clip, _ in found["pictures"]])],
+            [Clips(found["pictures"])],
         ),
     ]  # fmt: skip
-    if NO_COLOR_TERM in readings:
+    if NO_COLOR_TERM in methods:
         text = (
-            "This predictor adds to the attention logits how well a slot's colour fits the colour that a lexicon gives "
-            "for the word. Setting its learned gains to 0 in a copy of the model shows what the rest has learned by "
-            f"itself, and whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The "
-            "copy was not trained without the term, so this says what these weights rely on, not what could be learned."
+            "This predictor adds to the attention logits how well a slot's colour fits the lexicon's colour of the "
+            "word. With its learned gains set to 0 in a copy of the model, one sees what the rest has learned, and "
+            f"whether the motion still ends within {RELATIONS['in'].within_px:g} px of the named bowl. The copy was "
+            "not trained without the term: this says what these weights rely on, not what could be learned."
         )
-        caption = f"{mean_over} (without the colour term)."
-        without = word_map("attention_no_colour_term.png", readings[NO_COLOR_TERM], caption)
-        ends = measured(ENDS_TABLE, rows)
-        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends, without]))
+        ends = ENDS_TABLE.table(results.rows)
+        sections.insert(1, Section("Does the colour-matching term decide it?", text, [ends]))
     return sections
-
-
-def measured(spec: TableSpec, rows: Sequence[Row]) -> Table:
-    """A table without the lines of what this model does not have."""
-    return replace(spec, lines=[line for line in spec.lines if any(spec.points(rows, line))]).table(rows)
-
-
-def _nanmean(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Over the first axis; nan where nothing is known."""
-    seen = ~np.isnan(values)
-    sums = np.where(seen, values, 0.0).sum(0)
-    return np.where(seen.any(0), sums / np.maximum(seen.sum(0), 1), np.nan)
 
 
 SHORT_WORDS = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
 
 
-def group_maps(readings: Sequence[AttentionReading], groups: Sequence[str]) -> tuple[np.ndarray, list[str]]:
-    """Mean maps (n, h, G, W) of the groups that there are, and their names."""
-    maps_nhGW = _nanmean([one.map_nhGW for one in readings])
-    there = np.flatnonzero(~np.isnan(maps_nhGW).any((0, 1, 3))).tolist()
-    return maps_nhGW[:, :, there], [groups[g] for g in there]
+def mean_known(values: Any) -> np.ndarray:
+    """Over the first axis; nan where nothing is known."""
+    return np.asarray(np.ma.masked_invalid(values).mean(0).filled(np.nan))
 
 
-def word_map(
-    name: str,
-    readings: Sequence[AttentionReading],
-    caption: str,
-    groups: Sequence[str] = GROUPS,
-    words: Sequence[str] = SHORT_WORDS,
-) -> Figure:
-    """Mean share of each group's slots for each word."""
-    maps_nhGW, groups = group_maps(readings, groups)
-    return heat_map(name, maps_nhGW.mean((0, 1)), groups, words, label="attention to words", caption=caption)
+def curves(readings: Sequence[Sequence[AttentionReading]]) -> list[Figure]:
+    """Step by step: the share of each group for each colour word, and how often the named thing attends most.
+
+    Args:
+        readings: of each scene. Its texts are not independent, so they are averaged first.
+    """
+    shares_NRTG = np.array([mean_known([one.shares_RTG for one in its]) for its in readings])
+    most_NRT = np.array([np.mean([one.most_RT for one in its], axis=0) for its in readings])
+    drawn = []
+    for r, role in enumerate(ROLES):
+        shares = [(group, curve(shares_NRTG[:, r, :, g])) for g, group in enumerate(GROUPS)]
+        known, label = [one for one in shares if len(one[1])], f"share for the {role}'s colour"
+        drawn.append(curve_plot(f"shares_{role}.png", known, label=label, across="step"))
+    most = [(f"named {role}", curve(most_NRT[:, r])) for r, role in enumerate(ROLES)]
+    marks = [(float(np.mean([one.chance_R for its in readings for one in its])), "chance")]
+    return [*drawn, curve_plot("most.png", most, label="attends most", across="step", marks=marks)]
 
 
-def plot_curves(
-    name: str,
-    along_NT: Mapping[str, np.ndarray],
-    label: str,
-    caption: str,
-    marks: Sequence[tuple[float, str]] = (),
-) -> Figure:
-    """Means over scenes with intervals, step by step; nan for scenes that do not count."""
-    bands = []
-    for title, values_NT in along_NT.items():
-        known = values_NT[~np.isnan(values_NT).any(1)]
-        intervals = [bootstrap_interval(column, resamples=500) for column in known.T if len(known)]
-        if intervals:
-            bands.append((title, np.array([(one.value, one.low, one.high) for one in intervals])))
-    return curve_plot(name, bands, label=label, across="step", caption=caption, marks=marks)
+def curve(values_NT: np.ndarray) -> np.ndarray:
+    """(T, 3) mean over scenes, low, high; without the scenes that have no such thing, and empty if all have none."""
+    known_NT = values_NT[~np.isnan(values_NT).any(1)]
+    intervals = [bootstrap_interval(column, resamples=500) for column in known_NT.T if len(known_NT)]
+    return np.array([(one.value, one.low, one.high) for one in intervals])
 
 
 _, PLAIN, OTHERS, _, NEW = COLUMNS.values()

@@ -65,8 +65,7 @@ def main(args: Args) -> int:
     """Train what is missing; the exit status, 1 if a run failed (the others are trained all the same).
 
     Raises:
-        KeyError: if there is no run of a name in `args.only`.
-        OSError, ValueError: if the episodes cannot be read, or there is no such parser.
+        OSError, ValueError: if the episodes cannot be read, or there is no such parser or run.
     """
     console, failed = Console(), dict[str, str]()
     chosen = [run_named(name) for name in args.only] or RUNS
@@ -100,14 +99,10 @@ def main(args: Args) -> int:
 
 
 def run_named(name: str) -> AblationRun:
-    """The run of that name.
-
-    Raises:
-        KeyError: if there is none; the message lists those that exist.
-    """
+    """The run of that name. ValueError if there is none; the message lists those that exist."""
     runs = {run.key: run for run in RUNS}
     if name not in runs:
-        raise KeyError(f"unknown run {name!r}; known: {', '.join(runs)}")
+        raise ValueError(f"unknown run {name!r}; known: {', '.join(runs)}")
     return runs[name]
 
 
@@ -117,24 +112,14 @@ def train(run: AblationRun, args: Args, parser: Path) -> None:
     shared: dict[str, Any] = {"data": args.data, "val": args.val, "out": out, "seed": args.seed}
     shared |= {"preset": run.preset, "set": run.settings}
     if run.stage == "parser":
-        steps, episodes = args.parser_steps, args.episodes or ParserTraining.episodes
-        warmup = min(ParserTraining.warmup, steps // 4)
-        train_parser(
-            ParserTraining(**shared, steps=steps, batch=16, clip=2, warmup=warmup, episodes=episodes)
-        )
+        shared |= {"steps": args.parser_steps, "warmup": min(ParserTraining.warmup, args.parser_steps // 4)}
+        episodes = args.episodes or ParserTraining.episodes
+        train_parser(ParserTraining(**shared, batch=16, clip=2, episodes=episodes))
     else:
         share_slots(parser, args, out)
-        train_predictor(
-            PredictorTraining(
-                **shared,
-                parser=parser,
-                episodes=args.episodes,
-                steps=args.steps,
-                batch=32,
-                warmup=min(PredictorTraining.warmup, args.steps // 4),
-                autoregressive=1.0,
-            )
-        )
+        shared |= {"steps": args.steps, "warmup": min(PredictorTraining.warmup, args.steps // 4)}
+        shared |= {"parser": parser, "episodes": args.episodes}
+        train_predictor(PredictorTraining(**shared, batch=32, autoregressive=1.0))
 
 
 def share_slots(parser: Path, args: Args, out: Path) -> None:
@@ -162,8 +147,6 @@ def _link(source: str, target: str) -> None:
 if __name__ == "__main__":
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
-    except KeyError as error:
-        sys.exit(f"error: {error.args[0]}")
     except (OSError, ValueError) as error:  # CheckpointError is a ValueError
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -92,16 +92,15 @@ def judge_rollout(rollout: Rollout, ground: AppearanceGrounder, text: str) -> bo
 
 
 def imagine_and_judge(
-    world_model: Imagines, rgb_HW3: np.ndarray, ground: AppearanceGrounder, texts: Sequence[str], seed: int
+    world_model: Imagines, parsed: Rollout, ground: AppearanceGrounder, texts: Sequence[str], seed: int
 ) -> tuple[Rollout, Verdicts, Verdicts]:
-    """Imagine one scene with V instructions and one slot seed.
+    """Imagine one parsed scene (B = T = 1) with V instructions and one slot seed.
 
     Returns:
         the rollouts, one an instruction; the verdicts of each on its own instruction; and those on the next one of the
         list, for which it was not imagined. Both (1, V).
     """
     instructions = [Instruction.parse(text) for text in texts]
-    parsed = world_model.parse(rgb_HW3[None], seed=seed)
     rollout = world_model.rollout(parsed, list(texts), horizon=HORIZON, seed=seed)
     grounding = find_things(rollout, ground, instructions)
     ours, wrong = (

@@ -60,8 +60,11 @@ class StudyOracle:
     def __init__(self, stubborn: Sequence[str]) -> None:
         self._stubborn = stubborn
 
-    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
-        """One frame: the scene as it is now. Several: as many frames since the last reset, whatever they show."""
+    def parse(self, video: np.ndarray, *, seed: int = 0, num_slots: int | None = None) -> Rollout:
+        """One frame: the scene as it is now. Several: as many frames since the last reset, whatever they show.
+
+        It has a slot for everything, whatever `num_slots` says.
+        """
         oracle, now = self._oracle(), None
         parsed = oracle.parse(video[-1:], seed=seed)
         if len(video) == 1:

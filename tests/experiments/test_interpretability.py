@@ -3,7 +3,6 @@
 import json
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,12 +33,11 @@ from experiments.study.pool import Worker
 from experiments.study.run import Run, StudyArgs, UsageError, run
 from experiments.study.scenes import study_scenes
 from planning import Grounding, Instruction
-from tests.experiments.attentive import HEADS, LAYERS, Attentive, LoadAttentive
+from tests.experiments.attentive import HEADS, LAYERS, LoadAttentive
 from tests.experiments.oracle import LoadOracle
 from textocvp import WorldModel
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS
-from textocvp.rollout import Rollout
 
 TEXT = "put the red block in the blue bowl"
 PRESENT = np.array([True, True, True, False])
@@ -111,7 +109,7 @@ def test_who_attends_gets_full_marks_everywhere() -> None:
     for one in readings:
         assert one.most_R.all() and one.most_Rnh.shape == (2, LAYERS, HEADS) and one.most_Rnh.all()
         assert one.most_RT.shape == (2, 24) and one.most_RT.all() and one.ends_in_bowl
-        np.testing.assert_allclose(one.margin_R, 0.9 - 1 / 9, atol=1e-6)
+        np.testing.assert_allclose(one.lead_R, 0.9 - 1 / 9, atol=1e-6)
         # 8 slots are present: table, arm and 6 objects, without the two spare ones.
         np.testing.assert_allclose(one.chance_R, 1 / 8)
         np.testing.assert_allclose(one.shares_RTG[0, :, GROUPS.index("named block")], 0.9, atol=1e-6)
@@ -119,7 +117,7 @@ def test_who_attends_gets_full_marks_everywhere() -> None:
     assert figures_of("attends", BY_APPEARANCE) == [1.0] * 8
     # Under the wrong sentence other things attend.
     assert not any(figures_of("attends", WRONG))
-    assert not outcome("attends").figures[WRONG, "original", "ends_in_bowl"]
+    assert outcome("attends").figures[WRONG, "original", "ends_in_bowl"] == [False]
 
 
 def test_the_uniform_and_the_confused_get_nothing() -> None:
@@ -127,8 +125,8 @@ def test_the_uniform_and_the_confused_get_nothing() -> None:
         for one in outcome(kind).readings[OURS]:
             assert not one.most_R.any() and not one.most_Rnh.any() and not one.most_RT.any()
         assert figures_of(kind, BY_APPEARANCE) == [0.0] * 8
-    np.testing.assert_allclose(outcome("uniform").readings[OURS][0].margin_R, 0, atol=1e-6)
-    np.testing.assert_allclose(outcome("swapped").readings[OURS][0].margin_R, 0.1 / 8 - 0.9, atol=1e-6)
+    np.testing.assert_allclose(outcome("uniform").readings[OURS][0].lead_R, 0, atol=1e-6)
+    np.testing.assert_allclose(outcome("swapped").readings[OURS][0].lead_R, 0.1 / 8 - 0.9, atol=1e-6)
 
 
 def test_heads_and_steps_are_told_apart() -> None:
@@ -221,7 +219,7 @@ def test_the_folder_is_complete(folder: Path) -> None:
     assert set(data["seeds"]) == {"slots", "scenes, test", "scenes, controllability", "scenes, unseen_colors"}
     assert any(row["method"] == "ours, layer 2 head 3" for row in data["rows"])
     names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}
-    wanted = {"attention.png", "attention_heads.png", "heads_block.png", "shares_bowl.png", "words-worst.png"}
+    wanted = {"attention.png", "attention_heads.png", "heads_block.png", "shares_bowl.png", "most.png"}
     assert {f"plots/{name}" for name in wanted} <= names
     assert {"clips/attention-best-1.gif", "clips/attention-worst-1.gif"} <= names
     page = (folder / "report.html").read_text()
@@ -229,18 +227,7 @@ def test_the_folder_is_complete(folder: Path) -> None:
     assert "colour-matching term decide" not in page  # the double has none
 
 
-class Mute(Attentive):
-    """Keeps no attention."""
-
-    def rollout(self, *args: Any, attention: bool = False, **kwargs: Any) -> Rollout:
-        return super().rollout(*args, **kwargs)
-
-
-def test_a_model_without_attention_is_refused(tmp_path: Path) -> None:
-    LoadAttentive("attends")()
-    (scene,) = study_scenes("test", 1, 0)
-    with pytest.raises(UsageError, match="oracle keeps no attention"):
-        AttentionScene(scene, 0, 0).run(Worker(Mute("attends")))
+def test_a_model_that_reads_no_text_is_refused(tmp_path: Path) -> None:
     textless = WorldModel(TextOCVP(PRESETS["ocvp-seq-small"]))
     with pytest.raises(UsageError, match="reads no text"):
         run(STUDY, StudyArgs(out=tmp_path / "r", checkpoint="mine", workers=1), load=lambda: textless)
@@ -253,6 +240,6 @@ def test_a_thing_without_slot_is_a_miss() -> None:
     asked = Instruction.parse(TEXT)
     reading = read_attention(attention, PRESENT, Grounding((0,), (2,), {asked.thing: (1,)}), asked, False)
     assert reading.most_R.tolist() == [True, False]
-    assert reading.margin_R[0] == 1 and np.isnan(reading.margin_R[1])
+    assert reading.lead_R[0] == 1 and np.isneginf(reading.lead_R[1])
     assert reading.chance_R.tolist() == [pytest.approx(1 / 3), 0]
     assert np.isnan(reading.map_nhGW[0, 0, GROUPS.index("named bowl")]).all()

@@ -18,9 +18,7 @@ from textocvp.presets import PRESETS
 
 
 def tiny(key: str, label: str, *settings: str, stage: str = "predictor") -> AblationRun:
-    return AblationRun(
-        key=key, label=label, stage=stage, group="depth", preset="tiny-placed", settings=settings
-    )
+    return AblationRun(key=key, label=label, stage=stage, preset="tiny-placed", settings=settings)
 
 
 TINY = (
@@ -43,7 +41,7 @@ def test_every_run_is_a_model_of_its_own() -> None:
 
 def test_differences_are_named() -> None:
     assert differences(run_named("layers-1"), run_named("base").config) == ["predictor.layers is 3, wanted 1"]
-    with pytest.raises(KeyError, match=r"unknown run 'layer-1'; known: base, layers-1"):
+    with pytest.raises(ValueError, match=r"unknown run 'layer-1'; known: base, layers-1"):
         run_named("layer-1")
 
 
