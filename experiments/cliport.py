@@ -26,18 +26,17 @@ from envs.dataset import EpisodeConfig, record_episode
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks.base import CLIPORT_RADIUS
-from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, Paper, TableSpec
-from experiments.study.any_size import Seen, drawn, fitted, imagine
+from experiments.study.any_size import Seen, drawn, film, fitted, imagine, mask_curves
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import METHODS, Model, lines
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import Prediction, hold_last, to_uint8
+from experiments.study.predictions import Prediction, hold_last
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
 from planning import THRESHOLDS, Instruction, PinholeCamera, Thing
@@ -45,7 +44,7 @@ from planning.masks import centroids
 from textocvp.data import open_episodes
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeObject, Episodes
-from textocvp.metrics import foreground_ari, object_ious
+from textocvp.metrics import object_ious
 
 SIDE = 336  # pixels of our own scenes, as in the paper
 ALL = "all"  # the split of figures over all episodes
@@ -177,9 +176,8 @@ def prepare(run: Run) -> tuple[Sequence[Source], Sequence[str]]:
 
 def inputs(args: Args) -> list[Path]:
     """The files of the episodes."""
-    if args.episodes is None:
-        return []
-    return sorted(args.episodes.glob("*.npz")) if args.episodes.is_dir() else [args.episodes]
+    path = args.episodes
+    return [] if path is None else sorted(path.glob("*.npz")) if path.is_dir() else [path]
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
@@ -212,17 +210,6 @@ def misses(labels_THW: np.ndarray, truth: Episode, asked: Instruction) -> np.nda
     offset = place(labels_THW[0], float(start[2])) - start[:2]
     last = np.stack([place(labels, float(end[2])) for labels in labels_THW[-THRESHOLDS.settle_frames :]])
     return np.nan_to_num(np.linalg.norm(last - offset - places[0, bowl[0].id, :2], axis=1), nan=np.inf)
-
-
-def mask_curves(labels_THW: np.ndarray, truth: Episode) -> dict[str, np.ndarray]:
-    """Mean overlap with every object that is seen, and foreground ARI, of each frame after the first."""
-    if truth.segmentation is None or not truth.objects:
-        return {}
-    ids = [o.label for o in truth.objects]
-    pairs = list(zip(labels_THW[1:], truth.segmentation[1:], strict=True))
-    overlaps = [object_ious(labels, masks, ids, min_pixels=1).ious for labels, masks in pairs]
-    iou = [its.mean() if len(its) else np.nan for its in overlaps]
-    return {"iou": np.array(iou), "ari": np.array([foreground_ari(*pair) for pair in pairs])}
 
 
 def other_sentences(truth: Episode, asked: Instruction) -> tuple[list[Instruction], Instruction]:
@@ -303,20 +290,14 @@ class Film:
     def run(self, worker: Worker) -> Clip:
         """Imagine it once more."""
         source, truth = self.source, read(self.source, worker)
-        T, side, asked = len(truth.frames), truth.frames.shape[1], Instruction.parse(truth.instruction)
-        seen = imagine(worker, worker.world_model, truth.frames[0], asked.text, T - 1, self.seed)
-        rows = [[truth.frames, to_uint8(seen.frames)]]
-        if truth.segmentation is not None:
-            n, slots = len(truth.objects), int(seen.labels.max()) + 1
-            colors = slot_colors(seen.labels[0], truth.segmentation[0], slots, n)
-            rows.append([paint(truth.segmentation, segmentation_colors(n)), paint(seen.labels, colors)])
-        step = max(1, side // 168)  # a page of films at 336x336 is too large to be sent
+        asked, ahead = Instruction.parse(truth.instruction), len(truth.frames) - 1
+        seen = imagine(worker, worker.world_model, truth.frames[0], asked.text, ahead, self.seed)
         off, place = misses(seen.labels, truth, asked), f"{'best' if self.best else 'worst'} {self.rank}"
         ends = "" if off is None else f"; block ends {100 * off[-1]:.1f} cm off"
         name = f"{source.split}, seed {source.seed}" if isinstance(source, StudyScene) else source.name
         return Clip(
             name=f"cliport-{place.replace(' ', '-')}.gif",
-            gif=gif([[film[:, ::step, ::step] for film in row] for row in rows], scale=1),
+            gif=film(truth, seen),
             panels=("real", "ours"),
             title=asked.text,
             caption=f"{self.caption}{ends}; {name}",
@@ -377,13 +358,13 @@ def headline(run: Run) -> dict[str, Key]:
     """As asked for in the study's description; `_copy` for the first frame repeated, `_true` for true frames."""
     named: dict[str, Key] = {"n": ("episodes", ALL, ALL, "n")}
     for method, ending in {"ours": "", "copy frame": "_copy", "true frames": "_true"}.items():
-        for metric in ("psnr", "ssim", "lpips", "iou"):
-            for variant, length in LENGTHS.items():
-                named[f"{metric}_{length}{ending}"] = (method, ALL, variant, metric)
-        for name, variant in zip(("original", "variants"), SENTENCES, strict=True):
-            named[f"success_{name}{ending}"] = (method, ALL, variant, "success")
-    loop = {f"closed_loop_{split}": split for split in OWN_SPLITS}
-    return named | {name: ("ours", split, "original", "closed_loop_success") for name, split in loop.items()}
+        for metric, (variant, n) in product(("psnr", "ssim", "lpips", "iou"), LENGTHS.items()):
+            named[f"{metric}_{n}{ending}"] = (method, ALL, variant, metric)
+        named[f"success_original{ending}"] = (method, ALL, "original", "success")
+        named[f"success_variants{ending}"] = (method, ALL, "other bowls", "success")
+    for split in OWN_SPLITS:
+        named[f"closed_loop_{split}"] = ("ours", split, "original", "closed_loop_success")
+    return named
 
 
 # --- tables and page --------------------------------------------------------------------------------------------------
@@ -425,26 +406,26 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         ).table(figures, run.missing_keys)
         for split, spec in product(dict.fromkeys(one.split for one in episodes), (FRAMES, MASKS))
     ]  # fmt: skip
-    own = run.world_model.image_size[0]
     longest = {"ours": run.world_model.longest_horizon, **{model.key: model.longest for model in known}}
     limits = ", ".join(f"{key} {n} frames" for key, n in longest.items() if n)
-    untrained = {"Non-OC", "MAGE"} - longest.keys()
-    absent = [*run.remarks, *(f"Left out: {problem}." for problem in problems)] + [
+    absent = [*run.remarks, *(f"Left out: {problem}." for problem in problems)]
+    absent += [
         f"{key} is absent: none was trained in this scene; name one with --model {key}=FOLDER."
-        for key in sorted(untrained)
+        for key in ("Non-OC", "MAGE")
+        if key not in longest
     ]
     sections = [
         Section(
             "As in the paper's tables",
-            f"Imagined from the first frame and the sentence. {run.checkpoint.name} was trained on {own}x{own}. Models "
-            "with slots get an episode's frames as they are where their side is a whole multiple of that; other frames "
-            "are reduced to the model's size by area. What a model draws smaller than the episode is enlarged, so that "
-            "all lines are measured alike. Where an episode is longer than a model looks, its last frame is held: "
-            f"{limits or 'all look as far as they must'}. A sentence succeeds when the block that it names lies within "
-            f"{100 * CLIPORT_RADIUS:g} cm of where the named bowl stood, in the last {THRESHOLDS.settle_frames} "
-            "frames: CLIPort's own tolerance; a wrong text is judged for the episode's own sentence. The block's slot "
-            "is the one matched to it in the first frame; its way is measured through the camera. The paper's episodes "
-            "are others.",
+            f"Imagined from the first frame and the sentence, by {run.checkpoint.name}, which was trained on frames of "
+            f"{run.world_model.image_size[0]} pixels. Models with slots get an episode's frames as they are where its "
+            "side is a whole multiple of the model's; others are reduced by area, and what is drawn smaller than the "
+            "episode is enlarged, so that all lines are measured alike. Beyond what a model looks ahead "
+            f"({limits or 'all look as far as they must'}) its last frame is held. A sentence succeeds when the block "
+            f"that it names lies within {100 * CLIPORT_RADIUS:g} cm of where the named bowl stood, in the last "
+            f"{THRESHOLDS.settle_frames} frames: CLIPort's own tolerance. The block's slot is the one matched to it in "
+            "the first frame; its way is measured through the camera. A wrong text is judged for the episode's own "
+            "sentence. The paper's episodes are others.",
             [frames, masks],
         ),
         Section("By split", "The same figures by where the episodes come from.", by_split),
@@ -481,11 +462,10 @@ STUDY = Study(
     page=page,
     cards=[
         CardSpec(f"{column.title}, {key}", LINES[key], column, bar=False)
-        for key, columns in {
-            "ours": [*FRAMES.columns[1:3], MASKS.columns[0], *SUCCESS],
-            "copy frame": [FRAMES.columns[2]],
-        }.items()
-        for column in columns
+        for key, column in (
+            *product(["ours"], (*FRAMES.columns[1:3], MASKS.columns[0], *SUCCESS)),
+            ("copy frame", FRAMES.columns[2]),
+        )
     ],
     headline=headline,
     first=("lpips_9", "ssim_9", "iou_9", "success_original", "success_variants"),

@@ -1,4 +1,4 @@
-"""What models imagine at the size of the first frame, whatever their own: frames, and the slots that win the pixels."""
+"""Episodes of any size: what models of another size imagine, how its masks fit the truth, and a film of both."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
+from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
 from experiments.study.pool import Worker
 from experiments.study.predictions import to_uint8
+from textocvp.data.episodes import Episode
+from textocvp.metrics import foreground_ari, object_ious
 from textocvp.rollout import Rollout
 
 # Frames that are decoded at once: masks of a whole episode at 336x336 take a quarter of a gigabyte.
@@ -65,3 +68,25 @@ def imagine(worker: Worker, model: Any, first_HW3: np.ndarray, text: str, horizo
     frames = enlarged(model.imagine(first, [text], horizon=ahead, seed=seed)[0].float().cpu(), side)
     ours = worker.world_model
     return Seen(frames, drawn(ours.parse(fitted(to_uint8(frames), ours), seed=seed), side).labels)
+
+
+def mask_curves(labels_THW: np.ndarray, truth: Episode) -> dict[str, np.ndarray]:
+    """Mean overlap with every object that is seen, and foreground ARI, of each frame after the first."""
+    if truth.segmentation is None or not truth.objects:
+        return {}
+    ids = [o.label for o in truth.objects]
+    pairs = list(zip(labels_THW[1:], truth.segmentation[1:], strict=True))
+    overlaps = [object_ious(labels, masks, ids, min_pixels=1).ious for labels, masks in pairs]
+    iou = [its.mean() if len(its) else np.nan for its in overlaps]
+    return {"iou": np.array(iou), "ari": np.array([foreground_ari(*pair) for pair in pairs])}
+
+
+def film(truth: Episode, seen: Seen) -> bytes:
+    """A GIF: what happened beside what is imagined, above the masks where they are known."""
+    rows = [[truth.frames, to_uint8(seen.frames)]]
+    if truth.segmentation is not None:
+        n, slots = len(truth.objects), int(seen.labels.max()) + 1
+        colors = slot_colors(seen.labels[0], truth.segmentation[0], slots, n)
+        rows.append([paint(truth.segmentation, segmentation_colors(n)), paint(seen.labels, colors)])
+    step = max(1, truth.frames.shape[1] // 168)  # a page of films at 336x336 is too large to be sent
+    return gif([[its[:, ::step, ::step] for its in row] for row in rows], scale=1)
