@@ -151,13 +151,12 @@ class Subject:
         assert isinstance(self.model, WorldModel)
         world_model, model, options = self.model, self.model.model, {"use_cache": self.cached}
         parsed = world_model.parse(images_BHW3[:, None])
+        slots = parsed.slots
         # Slots of the observation will do: what slots hold does not change what drawing them costs.
         seen = replace(parsed, slots=parsed.slots.expand(-1, what.frames, -1, -1))
         return {
             "encode": lambda: world_model.parse(images_BHW3[:, None]),
-            "predict": lambda: model.predictor.rollout(
-                parsed.slots, model.text(texts), what.frames, **options
-            ),
+            "predict": lambda: model.predictor.rollout(slots, model.text(texts), what.frames, **options),
             # A selection of it each time: what a rollout has drawn it does not draw again.
             "decode": lambda: seen.select(slice(None)).frames,
         }
@@ -191,9 +190,8 @@ def subjects_of(run: Run) -> list[Subject]:
             run.remarks.append(f"{one.key} is absent: it looks at frames of {model.image_size} pixels.")
             continue
         phases = PHASES if isinstance(model, (WorldModel, MageVideoModel)) else ("all",)
-        subjects.append(
-            Subject(one.key, model, phases, most=heavy if isinstance(model, MageVideoModel) else None)
-        )
+        most = heavy if isinstance(model, MageVideoModel) else None
+        subjects.append(Subject(one.key, model, phases, most=most))
     if drawn:
         torch.manual_seed(0)
         config = preset("savi-cater")
@@ -220,14 +218,7 @@ def reshaped(model: TextOCVP, config: ModelConfig) -> WorldModel:
 
 
 def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Work:
-    """What a planner asks for once, or one of its costly parts.
-
-    Parse the picture, find the things in it, imagine 30 candidates for 24 frames, draw the masks that the scorer looks
-    at, score and judge.
-
-    Raises:
-        GroundingError: if the goal's things are not seen.
-    """
+    """What a planner asks for once, or one of its costly parts; a GroundingError if the goal's things are not seen."""
     assert isinstance(model, WorldModel)
     image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
     goal, parsed = Instruction.parse(sampled.texts[0]), model.parse(image_1HW3)
@@ -236,6 +227,7 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
     texts = [allowed[i % len(allowed)].text for i in range(CANDIDATES)]
 
     def query() -> object:
+        """Parse, find the things, imagine every candidate, draw the masks that the scorer looks at, score and judge."""
         parsed = model.parse(image_1HW3)
         grounding = ground(parsed).with_kinds(goal.things)
         rollout = model.rollout(parsed, texts, horizon=STEPS)
