@@ -8,42 +8,37 @@ Milliseconds for 1, 9 and 24 imagined frames, for one scene and for 16, encode, 
 thread and on all: the shipped model, the same without its cache and in the published form (a window computed again at
 every step), the baselines that are there, and the paper's own sizes with random weights, which is good for timing and
 nothing else. Competitors take turns in every round, so ratios hold on a busy machine too; they are the figures that
-travel between machines. Writes `results.json`, `report.html` and a plot into `--out`.
+travel between machines. Writes `results.json` and `report.html` into `--out`.
 """
 
 from __future__ import annotations
 
 import os
-import platform
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 import torch
-from scipy.stats import binom
 
-from experiments.report.page import Card, CardSpec, Section
-from experiments.report.plots import plot_table
+from experiments.report.page import CardSpec, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, interval_row
 from experiments.report.tables import Column, Line, Table, TableSpec
-from experiments.study.methods import BASELINES, Missing, lines
-from experiments.study.pool import Worker, available_cores
+from experiments.study.methods import BASELINES, lines
+from experiments.study.pool import Worker
 from experiments.study.run import Found, Part, Run, Study, UsageError, start
 from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes
+from experiments.study.timing import CORES, Work, machine_in_words, median_interval, race
 from planning import AppearanceGrounder, Instruction, measure_rollout, watched_frames
 from planning.scores import DEFAULT_CRITERION, DEFAULT_SCORE
-from textocvp.baselines.mage import Mage, MageVideoModel, mage_preset
+from textocvp.baselines.mage import MageVideoModel
 from textocvp.config import ModelConfig
 from textocvp.metrics.intervals import Interval
 from textocvp.model import TextOCVP
 from textocvp.presets import preset
 from textocvp.protocols import VideoModel
-from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
 
 UNTRAINED = "untrained, timing only"
@@ -62,14 +57,10 @@ AGAINST = {WINDOW: OURS, UNCACHED: OURS, PAPER_WINDOW: PAPER_CACHE}
 """What each is compared with in every phase. What is not here is compared with ours, all phases together."""
 CANDIDATES, STEPS, STRIDE = 30, 24, 3  # of a planning query
 QUERY = f"planning query, {CANDIDATES} candidates x {STEPS} frames"
-CORES = available_cores()
-FEWEST = 3  # rounds that are always made, however long they take
 
 Phase = Literal["encode", "predict", "decode", "all", "query", "imagine", "masks"]
 PHASES: tuple[Phase, ...] = ("encode", "predict", "decode", "all")
 PLANNING: tuple[Phase, ...] = ("query", "imagine", "masks")
-Work = Callable[[], object]
-Name = TypeVar("Name")
 
 
 @dataclass(frozen=True)
@@ -80,10 +71,10 @@ class Sizes:
     batches: tuple[int, ...]  # numbers of scenes at once
     repeats: int  # rounds of each measurement
     seconds: float  # for all models together; what has used its share of them is measured 3 times only
-    # Frames of all scenes together, at most: that are drawn at the paper's sizes, as each takes half a second (0 leaves
-    # these sizes out), and that what is slower than the shipped model by far is asked for.
+    # Frames of all scenes together, at most, that are drawn at the paper's sizes, as each takes half a second (0 leaves
+    # these sizes out), and that are asked of what is slower than the shipped model by far.
     drawn: int
-    heavy: int = 1_000_000
+    heavy: int | None = None
     threads: tuple[int, ...] = tuple(sorted({1, CORES}))  # of PyTorch
 
 
@@ -125,63 +116,6 @@ def all_timings(frames: Sequence[int], batches: Sequence[int], threads: Sequence
     return made + [Timing(phase, STEPS, CANDIDATES, n) for n, phase in product(threads, PLANNING)]
 
 
-# --- how time is taken ------------------------------------------------------------------------------------------------
-
-
-def race(
-    works: Mapping[Name, Work], repeats: int, seconds: float, clock: Callable[[], float] = time.perf_counter
-) -> dict[Name, np.ndarray]:
-    """(rounds,) seconds of each piece of work, after one round that does not count.
-
-    In every round each has its turn, starting with another one, so that whatever else the machine does meets all of
-    them alike and the ratio of two of them in one round means something. What has used its equal share of `seconds`
-    takes no part after the third of `repeats` rounds, so that it does not cut short what is quick.
-    """
-    for work in works.values():
-        work()
-    taken: dict[Name, list[float]] = {name: [] for name in works}
-    for number in range(repeats):
-        running = [
-            name
-            for name, rounds in taken.items()
-            if len(rounds) == number and (number < FEWEST or sum(rounds) < seconds / len(works))
-        ]
-        turn = number % max(1, len(running))
-        for name in running[turn:] + running[:turn]:
-            began = clock()
-            works[name]()
-            taken[name].append(clock() - began)
-    return {name: np.array(rounds) for name, rounds in taken.items()}
-
-
-def median_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
-    """A median and its distribution-free interval: from one order statistic to another.
-
-    With fewer than 6 values no such interval reaches 95 %; it is then their range.
-
-    Raises:
-        ValueError: if there is no value.
-    """
-    ordered = np.sort(np.asarray(values, dtype=np.float64))
-    n = len(ordered)
-    if n == 0:
-        raise ValueError("no values to take a median of")
-    # P(the median lies between the k-th smallest and the k-th largest) = 1 - 2 P(Binomial(n, 1/2) < k)
-    k = max(1, int(binom.ppf((1 - confidence) / 2, n, 0.5)))
-    return Interval(float(np.median(ordered)), float(ordered[k - 1]), float(ordered[n - k]), n)
-
-
-def machine_in_words() -> str:
-    """What figures in seconds depend on, without the machine's name."""
-    told = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
-    named = [line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")]
-    processor = named[0] if named else platform.machine() or "unknown processor"
-    return (
-        f"{CORES} core{'s' if CORES != 1 else ''} ({processor}), PyTorch {torch.__version__} in float32, "
-        f"Python {platform.python_version()}, {platform.system()}"
-    )
-
-
 # --- what is timed ----------------------------------------------------------------------------------------------------
 
 
@@ -193,14 +127,15 @@ class Subject:
     model: VideoModel
     phases: tuple[Phase, ...] = PHASES  # that are asked for
     drawn: int | None = None  # the most frames of all scenes together that it is asked to draw
-    heavy: bool = False  # whether it takes so long that a first look leaves out its large measurements
+    most: int | None = None  # the same, of any phase
     cached: bool = True  # whether keys and values are kept
 
     def work(self, what: Timing, sampled: Sequence[SampledScene]) -> Work | None:
         """The work of a measurement; None for what the model cannot do or is not asked."""
-        longest, count = self.model.longest_horizon, what.frames * what.batch
-        too_many = what.phase in ("decode", "all") and self.drawn is not None and count > self.drawn
-        if what.phase not in self.phases or (longest is not None and what.frames > longest) or too_many:
+        count = what.frames * what.batch
+        limits = [(what.frames, self.model.longest_horizon), (count, self.most)]
+        limits += [(count, self.drawn)] if what.phase in ("decode", "all") else []
+        if what.phase not in self.phases or any(limit is not None and n > limit for n, limit in limits):
             return None
         if what.phase in PLANNING:
             return planning_work(self.model, what.phase, sampled[0])
@@ -210,39 +145,38 @@ class Subject:
             return lambda: self.model.imagine(images_BHW3, texts, horizon=what.frames)
         cut = self._codes if isinstance(self.model, MageVideoModel) else self._slots
         with torch.no_grad():
-            return torch.no_grad()(cut(what, images_BHW3, texts))
+            return torch.no_grad()(cut(what, images_BHW3, texts)[what.phase])
 
-    def _slots(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Work:
+    def _slots(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Mapping[Phase, Work]:
         assert isinstance(self.model, WorldModel)
-        world_model, model = self.model, self.model.model
-        if what.phase == "encode":
-            return lambda: world_model.parse(images_BHW3[:, None])
+        world_model, model, options = self.model, self.model.model, {"use_cache": self.cached}
         parsed = world_model.parse(images_BHW3[:, None])
-        seed_B1KD = parsed.slots
-        if what.phase == "predict":
-            options = {"use_cache": self.cached}
-            return lambda: model.predictor.rollout(seed_B1KD, model.text(texts), what.frames, **options)
+        slots = parsed.slots
         # Slots of the observation will do: what slots hold does not change what drawing them costs.
-        slots_BTKD = seed_B1KD.expand(-1, what.frames, -1, -1)
-        rest = tuple(texts), parsed.image_size, model.parser.layout, model.renderer, None, parsed.seen
-        return lambda: Rollout(slots_BTKD, *rest).frames
+        seen = replace(parsed, slots=parsed.slots.expand(-1, what.frames, -1, -1))
+        return {
+            "encode": lambda: world_model.parse(images_BHW3[:, None]),
+            "predict": lambda: model.predictor.rollout(slots, model.text(texts), what.frames, **options),
+            # A selection of it each time: what a rollout has drawn it does not draw again.
+            "decode": lambda: seen.select(slice(None)).frames,
+        }
 
-    def _codes(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Work:
+    def _codes(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Mapping[Phase, Work]:
         assert isinstance(self.model, MageVideoModel)
         model = self.model.model
         frames_B3HW = torch.from_numpy(images_BHW3).permute(0, 3, 1, 2).float() / 127.5 - 1
-        if what.phase == "encode":
-            return lambda: model.vqvae.encode(frames_B3HW)
         seen_B1hw = model.vqvae.encode(frames_B3HW)[:, None]
-        if what.phase == "predict":
-            return lambda: model.axial.imagine(seen_B1hw, model.text(texts), what.frames)
         codes_Nhw = seen_B1hw.expand(-1, what.frames, -1, -1).flatten(0, 1)
-        return lambda: model.vqvae.decode(codes_Nhw)
+        return {
+            "encode": lambda: model.vqvae.encode(frames_B3HW),
+            "predict": lambda: model.axial.imagine(seen_B1hw, model.text(texts), what.frames),
+            "decode": lambda: model.vqvae.decode(codes_Nhw),
+        }
 
 
 def subjects_of(run: Run) -> list[Subject]:
     """Ours in its forms, the baselines that are there, and the paper's sizes."""
-    ours, missing, drawn = run.world_model, list(run.missing), run.sizes.drawn
+    ours, drawn, heavy = run.world_model, run.sizes.drawn, run.sizes.heavy
     if not isinstance(ours, WorldModel):
         raise UsageError(f"{run.args.checkpoint} is no world model whose phases are known")
     subjects = [
@@ -253,23 +187,18 @@ def subjects_of(run: Run) -> list[Subject]:
     for one in run.models:
         model = one.load()
         if tuple(model.image_size) != tuple(ours.image_size):
-            missing.append(Missing(one.key, f"it looks at frames of {model.image_size} pixels"))
-        else:
-            phases = PHASES if isinstance(model, (WorldModel, MageVideoModel)) else ("all",)
-            subjects.append(Subject(one.key, model, phases, heavy=isinstance(model, MageVideoModel)))
-    torch.manual_seed(0)
-    if "MAGE" in {
-        absent.key for absent in missing
-    }:  # how long it takes does not depend on what it has learned
-        missing.append(Missing("MAGE (trained)", "it was timed with random weights"))
-        subjects.append(Subject("MAGE", MageVideoModel(Mage(mage_preset("mage-small"))), heavy=True))
-    run.missing = tuple(missing)
+            run.remarks.append(f"{one.key} is absent: it looks at frames of {model.image_size} pixels.")
+            continue
+        phases = PHASES if isinstance(model, (WorldModel, MageVideoModel)) else ("all",)
+        most = heavy if isinstance(model, MageVideoModel) else None
+        subjects.append(Subject(one.key, model, phases, most=most))
     if drawn:
+        torch.manual_seed(0)
         config = preset("savi-cater")
-        paper = TextOCVP(config)
         causal = replace(config, predictor=replace(config.predictor, attention="causal", window=STEPS))
-        subjects.append(Subject(PAPER_WINDOW, WorldModel(paper), drawn=drawn, heavy=True))
-        subjects.append(Subject(PAPER_CACHE, reshaped(paper, causal), ("predict", "all"), drawn, heavy=True))
+        paper = TextOCVP(config)
+        subjects.append(Subject(PAPER_WINDOW, WorldModel(paper), PHASES, drawn, heavy))
+        subjects.append(Subject(PAPER_CACHE, reshaped(paper, causal), ("predict", "all"), drawn, heavy))
     return subjects
 
 
@@ -289,14 +218,7 @@ def reshaped(model: TextOCVP, config: ModelConfig) -> WorldModel:
 
 
 def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Work:
-    """What a planner asks for once, or one of its costly parts.
-
-    Parse the picture, find the things in it, imagine 30 candidates for 24 frames, draw the masks that the scorer looks
-    at, score and judge.
-
-    Raises:
-        GroundingError: if the goal's things are not seen.
-    """
+    """What a planner asks for once, or one of its costly parts; a GroundingError if the goal's things are not seen."""
     assert isinstance(model, WorldModel)
     image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
     goal, parsed = Instruction.parse(sampled.texts[0]), model.parse(image_1HW3)
@@ -305,19 +227,19 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
     texts = [allowed[i % len(allowed)].text for i in range(CANDIDATES)]
 
     def query() -> object:
+        """Parse, find the things, imagine every candidate, draw the masks that the scorer looks at, score and judge."""
         parsed = model.parse(image_1HW3)
         grounding = ground(parsed).with_kinds(goal.things)
         rollout = model.rollout(parsed, texts, horizon=STEPS)
         trace = measure_rollout(rollout, grounding, goal, frames=frames)
         return DEFAULT_SCORE(trace), DEFAULT_CRITERION(trace)
 
-    if phase == "query":
-        return query
-    if phase == "imagine":
-        return lambda: model.rollout(parsed, texts, horizon=STEPS)
     rollout = model.rollout(parsed, texts, horizon=STEPS)
-    # A selection of it each time: what a rollout has drawn it does not draw again.
-    return lambda: rollout.select(slice(None)).decode_masks(frames)
+    return {
+        "query": query,
+        "imagine": lambda: model.rollout(parsed, texts, horizon=STEPS),
+        "masks": lambda: rollout.select(slice(None)).decode_masks(frames),
+    }[phase]
 
 
 # --- units of work ----------------------------------------------------------------------------------------------------
@@ -326,7 +248,8 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
 def prepare(run: Run) -> tuple[list[Subject], list[SampledScene], float]:
     """Who is timed, what they look at, and how busy the cores were before: 0 idle, 1 all busy, more if work queued."""
     busy = os.getloadavg()[0] / CORES if hasattr(os, "getloadavg") else 0.0
-    scenes = study_scenes("test", max(run.sizes.batches), run.args.seed)
+    side = run.world_model.image_size[0]
+    scenes = study_scenes("test", max(run.sizes.batches), run.args.seed, image_size=side)
     env = scenes[0].make()
     sampled = [sample_scene(env, scene) for scene in scenes]
     env.close()
@@ -349,15 +272,10 @@ class Race:
         """Time it."""
         what, sizes, (subjects, sampled, _) = self.what, self.study.sizes, self.study.prepared
         torch.set_num_threads(what.threads)
-        works = {
-            (one.name, what): work
-            for one in subjects
-            if not (one.heavy and what.frames * what.batch > sizes.heavy)
-            and (work := one.work(what, sampled)) is not None
-        }
+        works = {one.name: work for one in subjects if (work := one.work(what, sampled)) is not None}
         taken = race(works, sizes.repeats, sizes.seconds * (2 if what.phase in PLANNING else 1))
         torch.set_num_threads(1)  # as for every unit of a study
-        return taken
+        return {(name, what): seconds for name, seconds in taken.items()}
 
 
 def units(run: Run) -> dict[str, Part]:
@@ -421,7 +339,7 @@ FIGURES = (
     ("batch_16_per_scene", f"{OURS}: {BATCH}", "all, 9 x 16", "ratio", "", ""),
     ("one_thread_over_all", f"{OURS}: {THREADS}", "all, 9 x 16", "ratio", "", ""),
     ("planning_queries_per_second", OURS, QUERY, "queries_per_second", "Planning queries a second", "bar: 1"),
-    ("milliseconds_9_frames", OURS, "all, 9 x 1", "milliseconds", "9 frames, one scene", "all phases"),
+    ("milliseconds_9_frames", OURS, "all, 9 x 1", "milliseconds", "Milliseconds, 9 frames", "one scene, all phases"),
 )  # fmt: skip
 
 
@@ -442,29 +360,18 @@ RATIOS += [
 ]
 
 
-def phase_spec(metric: str, threads: int, batch: int, frames: Sequence[int] = DEFAULT.frames) -> TableSpec:
-    """Milliseconds or ratios of every phase for one number of threads and one batch."""
-    made = [
-        t
-        for t in all_timings(frames, [batch], [threads])
-        if t.phase in PHASES or (batch == 1 and (metric, t.phase) != ("milliseconds", "query"))
-    ]
-    titles = [
-        f"{t.phase} {t.frames} x {t.batch}" if t.phase in PLANNING else f"{t.phase} {t.frames}" for t in made
-    ]
+def phase_spec(metric: str, threads: int, sizes: Sizes = DEFAULT) -> TableSpec:
+    """Milliseconds or ratios of every phase on so many threads; of planning, queries a second."""
+    timings = all_timings(sizes.frames, sizes.batches, [threads])
+    columns = [Column(what.place[1], *what.place, metric, None) for what in timings]
+    if metric == "milliseconds":
+        columns.append(Column("queries a second", threads_word(threads), QUERY, "queries_per_second", None))
     return TableSpec(
-        f"{'Ratios' if metric == 'ratio' else 'Milliseconds'}, {threads_word(threads)}, batch {batch}",
-        [Column(title, *t.place, metric, None) for title, t in zip(titles, made, strict=True)],
+        f"{metric.capitalize()}, {threads_word(threads)}",
+        columns,
         RATIOS if metric == "ratio" else LINES,
+        f"9 x 16: 9 frames of 16 scenes. {QUERY.capitalize()}.",
     )
-
-
-def planning_spec(threads: int) -> TableSpec:
-    """Planning queries and candidates a second."""
-    place = Timing("query", STEPS, CANDIDATES, threads).place
-    words = {"queries a second": "queries_per_second", "candidates a second": "candidates_per_second"}
-    made = [Column(title, *place, metric, None) for title, metric in words.items()]
-    return TableSpec(f"Planning, {threads_word(threads)}", made, LINES[:2], f"{QUERY.capitalize()}.")
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
@@ -477,57 +384,32 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "queries a second are too slow by about that; ratios are taken within a round and hold."
         )
 
-    def tables(metric: str) -> list[Table]:
-        """Without the lines in which nothing was measured."""
-        made = []
-        for threads, batch in product(reversed(sizes.threads), sizes.batches):
-            spec = phase_spec(metric, threads, batch, sizes.frames)
-            measured = [line for line in spec.lines if any(spec.points(figures, line))]
-            made.append(replace(spec, lines=measured).table(figures))
-        return made
+    def table(spec: TableSpec) -> Table:
+        """Without the lines and columns in which nothing was measured."""
+        columns, measured = spec.table(figures).measured()
+        columns_there = [spec.columns[c] for c in columns]
+        return replace(spec, columns=columns_there, lines=[spec.lines[r] for r in measured]).table(figures)
 
-    count, most = 9 if 9 in sizes.frames else sizes.frames[-1], max(sizes.threads)
-    drawn = phase_spec("milliseconds", most, 1, (count,))
-    # The paper's sizes take many times longer: on one axis with them nothing else could be told apart.
-    small = [line for line in LINES if line.key not in (PAPER_WINDOW, PAPER_CACHE)]
-    caption = f"{count} frames of one scene, {threads_word(most)}; the paper's sizes are in the tables."
-    shown = replace(drawn, columns=drawn.columns[: len(PHASES)], lines=small)
-    plot = plot_table("phases.png", shown, figures, label="milliseconds", limits=None, caption=caption)
+    threads = sizes.threads[::-1]
     return [
         Section(
             "Where the time goes",
             f"{machine} Medians of repeats with their 95 % intervals (their range where there are fewer than 6). "
             "Encode: one observed frame to slots or codes. Predict: read the sentences, imagine. Decode: draw colours "
-            "and masks. All: from observed frames to imagined ones. A dash: there is no such phase; or, at the "
-            f"paper's sizes, more than {sizes.drawn} frames to draw; a quick run also leaves out large batches of what "
-            "is slow. " + " ".join(run.remarks),
-            [*tables("milliseconds"), plot],
+            "and masks. All: from observed frames to imagined ones. Query: what a planner asks before it acts; it "
+            "needs masks at few frames, and colours at none. A dash: there is no such phase; or, at the paper's "
+            f"sizes, more than {sizes.drawn} frames to draw; a quick run leaves out large batches of what is slow. "
+            + " ".join(run.remarks),
+            [table(phase_spec("milliseconds", n, sizes)) for n in threads],
         ),
         Section(
             "Figures that travel between machines",
             "How many times longer. Milliseconds depend on the machine, ratios much less. Where two models are "
             "compared, the ratio is taken in each round, in which both had their turn, and the median counts. "
             "Untrained models are good for timing only.",
-            tables("ratio"),
-        ),
-        Section(
-            "Thinking before acting",
-            "One query parses the picture, finds the things in it, imagines every candidate, draws the masks that the "
-            "scorer looks at, scores and judges. A planner needs masks at few frames, and colours at none.",
-            [planning_spec(threads).table(figures) for threads in reversed(sizes.threads)],
+            [table(phase_spec("ratio", n, sizes)) for n in threads],
         ),
     ]
-
-
-def cards(run: Run, results: Results) -> list[Card]:
-    """What the cache saves, what drawing costs, and how fast a robot thinks."""
-    made, units = [], {"ratio": " x", "milliseconds": " ms"}
-    for _, method, variant, metric, label, compare in FIGURES:
-        column = Column("", threads_word(max(run.sizes.threads)), variant, metric, None)
-        card = CardSpec(label, Line(key=method), column, compare, bar=False, each="repeats").fill(results)
-        if label:
-            made.append(replace(card, value=card.value + (units.get(metric, "") if card.detail else "")))
-    return made
 
 
 STUDY = Study(
@@ -540,12 +422,16 @@ STUDY = Study(
     one_process=True,  # so that nothing disturbs it
     units=units,
     rows=rows,
-    tables=[
-        phase_spec("milliseconds", CORES, 1), phase_spec("ratio", CORES, 1), phase_spec("ratio", CORES, 16),
-        planning_spec(CORES),
-    ],
+    tables=[phase_spec("milliseconds", CORES), phase_spec("ratio", CORES)],
     page=page,
-    cards=cards,
+    cards=[
+        CardSpec(
+            label, Line(key=method), Column("", threads_word(CORES), variant, metric, None), against,
+            bar=False, each="repeats",
+        )
+        for _, method, variant, metric, label, against in FIGURES
+        if label
+    ],
     headline=headline,
     first=(
         "window_over_cache_9_frames", "paper_window_over_cache_9_frames", "mage_over_textocvp_9_frames",

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from experiments.cliport import STUDY, Args, Judge, Sizes, fitted, mask_curves, succeeds
+from envs.tasks.base import CLIPORT_RADIUS
+from experiments.cliport import STUDY, Args, Sizes, misses
 from experiments.report.results import Results
+from experiments.study.any_size import fitted, mask_curves
 from experiments.study.frame_metrics import Measures
 from experiments.study.run import UsageError, run
 from planning import Instruction, PinholeCamera
@@ -25,6 +28,9 @@ INTRINSICS = np.array([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
 EXTRINSICS = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
 START, BOWL, OTHER = (-0.2, 0.1, 0.03), (0.25, -0.2, 0.02), (-0.2, -0.25, 0.02)
 T = 12
+ASKED, OTHER_BOWL = (
+    Instruction.parse(f"put the red block in the {color} bowl") for color in ("blue", "gray")
+)
 
 
 def made_up(end: tuple[float, float, float]) -> Episode:
@@ -56,20 +62,31 @@ def test_success_is_5_cm_from_the_bowl_as_in_cliport(off: float) -> None:
     truth = made_up((BOWL[0] - off, BOWL[1], 0.06))
     masks = truth.segmentation
     assert masks is not None
-    judge = Judge(truth, block=1, slot=3)
-    found = judge.misses(masks[-3:], masks[0], bowl=0)
+    found = misses(masks, truth, ASKED)
     assert found == pytest.approx([off] * 3, abs=0.008)  # half a pixel
-    assert succeeds(found) == (off < 0.05)
-    assert not succeeds(judge.misses(masks[-3:], masks[0], bowl=2))
-    assert not succeeds(judge.misses(masks[:3], masks[0], bowl=0))  # it has not moved yet
+    assert CLIPORT_RADIUS == 0.05
+    other, unmoved = misses(masks, truth, OTHER_BOWL), misses(masks[:3], truth, ASKED)
+    assert other is not None and unmoved is not None and min(*other, *unmoved) > CLIPORT_RADIUS
 
 
 def test_a_block_that_no_pixel_shows_is_nowhere() -> None:
     truth = made_up(BOWL)
     assert truth.segmentation is not None
     hidden = np.where(truth.segmentation == 3, 0, truth.segmentation)
-    for last, first in ((hidden, truth.segmentation), (truth.segmentation, hidden)):
-        assert not succeeds(Judge(truth, 1, 3).misses(last[-3:], first[0], 0))
+    seen_first = np.concatenate([truth.segmentation[:1], hidden[1:]])
+    assert misses(seen_first, truth, ASKED) == pytest.approx([np.inf] * 3)
+    seen_last = np.concatenate([hidden[:1], truth.segmentation[1:]])
+    found = misses(seen_last, truth, ASKED)
+    assert found is not None and (found > CLIPORT_RADIUS).all()
+
+
+def test_what_is_named_twice_or_not_known_is_not_judged() -> None:
+    truth = made_up(BOWL)
+    assert truth.segmentation is not None
+    twice = replace(truth, objects=(*truth.objects, EpisodeObject(3, 5, "bowl", "blue")))
+    for unknown in (twice, replace(truth, position=None), replace(truth, extrinsics=None)):
+        assert misses(truth.segmentation, unknown, ASKED) is None
+    assert misses(truth.segmentation, truth, Instruction.parse("put the red block in the green bowl")) is None
 
 
 def test_masks_that_are_the_truth_score_1_and_no_object_is_left_out() -> None:
@@ -133,7 +150,7 @@ def test_the_study_measures_what_can_be_measured(
     assert "psnr_19" not in results.headline and "iou_9_true" in results.headline
     assert {row.split for row in results.rows} == {"all", "made-up"}
     told, text = capsys.readouterr().err, (tmp_path / "out" / "report.html").read_text()
-    for words in ("none.npz: it has no frames", "c.npz, episode 0: its sentence cannot be read"):
+    for words in ("none.npz: it has no frames", "c.npz: its sentence cannot be read"):
         assert words in told and words in text
 
 

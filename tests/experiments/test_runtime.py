@@ -17,13 +17,11 @@ from experiments.runtime import (
     Subject,
     Timing,
     all_timings,
-    machine_in_words,
-    median_interval,
     published_form,
-    race,
 )
 from experiments.study.run import StudyArgs, run
 from experiments.study.scenes import SampledScene, StudyScene
+from experiments.study.timing import machine_in_words, median_interval, race
 from tests.textocvp.conftest import PLACED, build
 from textocvp.world_model import WorldModel
 

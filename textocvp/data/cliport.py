@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from textocvp.data.episodes import FIRST_OBJECT, ROBOT, EpisodeObject, Episodes, Truth, swapped_questions
+from textocvp.data.episodes import (
+    FIRST_OBJECT,
+    ROBOT,
+    Episode,
+    EpisodeObject,
+    Episodes,
+    Truth,
+    swapped_questions,
+)
 
 
 class CliportEpisodes(Episodes):
@@ -77,21 +85,29 @@ class CliportEpisodes(Episodes):
 
     def truth(self, index: int) -> Truth:
         """Masks, objects, poses and camera; the questions only where the sentence names one block and one bowl."""
-        arrays = read_episode(self.files[index])
-        meta = arrays["meta"]
-        pairs = enumerate(zip(meta["kinds"], meta["colors"], strict=True))
-        objects = tuple(EpisodeObject(i, FIRST_OBJECT + i, kind, color) for i, (kind, color) in pairs)
-        blocks, bowls = meta.get("named_blocks", ()), meta.get("named_bowls", ())
-        one_pair = len(blocks) == len(bowls) == 1
-        return Truth(
-            segmentation=arrays["segmentation"],
-            robot=ROBOT,
-            objects=objects,
-            questions=swapped_questions(meta["caption"], objects, blocks[0], bowls[0]) if one_pair else (),
-            position=arrays["position"],
-            intrinsics=arrays["intrinsics"],
-            extrinsics=arrays["extrinsics"],
-        )
+        return _truth(read_episode(self.files[index]))
+
+    def episode(self, index: int) -> Episode:
+        arrays = read_episode(self.files[index])  # once, where `frames` and `truth` would read it twice
+        known = vars(_truth(arrays))
+        return Episode(frames=arrays["frames"], instruction=self.instructions[index], **known)
+
+
+def _truth(arrays: dict[str, Any]) -> Truth:
+    meta = arrays["meta"]
+    pairs = enumerate(zip(meta["kinds"], meta["colors"], strict=True))
+    objects = tuple(EpisodeObject(i, FIRST_OBJECT + i, kind, color) for i, (kind, color) in pairs)
+    blocks, bowls = meta.get("named_blocks", ()), meta.get("named_bowls", ())
+    one_pair = len(blocks) == len(bowls) == 1
+    return Truth(
+        segmentation=arrays["segmentation"],
+        robot=ROBOT,
+        objects=objects,
+        questions=swapped_questions(meta["caption"], objects, blocks[0], bowls[0]) if one_pair else (),
+        position=arrays["position"],
+        intrinsics=arrays["intrinsics"],
+        extrinsics=arrays["extrinsics"],
+    )
 
 
 def read_episode(file: Path) -> dict[str, Any]:

@@ -110,6 +110,11 @@ class Episodes(ABC):
         """What is known of an episode; None where nothing is."""
         return None
 
+    def episode(self, index: int) -> Episode:
+        """Everything of an episode."""
+        known = vars(self.truth(index) or Truth())
+        return Episode(frames=self.frames(index), instruction=self.instructions[index], **known)
+
     @property
     def vocabulary(self) -> tuple[str, ...]:
         """The words that sentences about such scenes can contain; by default those of the instructions."""

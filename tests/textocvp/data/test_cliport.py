@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from textocvp.data import open_episodes
-from textocvp.data.cliport import CliportEpisodes
+from textocvp.data import cliport, open_episodes
+from textocvp.data.cliport import CliportEpisodes, read_episode
 
 CAPTION = "put the red blocks in a blue bowl"
 
@@ -46,6 +46,11 @@ def test_an_episode_is_read_as_it_is(tmp_path: Path) -> None:
         assert np.array_equal(episodes.frames(0), stored["frames"])
         truth = episodes.truth(0)
         assert truth is not None and np.array_equal(truth.segmentation, stored["segmentation"])
+        whole = episodes.episode(0)
+        assert np.array_equal(whole.frames, stored["frames"]) and np.array_equal(
+            whole.position, stored["position"]
+        )
+    assert (whole.instruction, whole.objects, whole.questions) == (CAPTION, truth.objects, truth.questions)
     assert [(o.label, o.kind, o.color) for o in truth.objects][1] == (3, "block", "red")
     asked = {question.text: (question.moves, question.ends_at) for question in truth.questions}
     assert asked == {CAPTION: (1, 0), "put the red blocks in a gray bowl": (1, 2)}
@@ -85,3 +90,10 @@ def test_without_a_usable_episode_there_is_an_error(tmp_path: Path) -> None:
         CliportEpisodes(tmp_path)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         CliportEpisodes(tmp_path / "nowhere")
+
+
+def test_a_whole_episode_is_read_from_its_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes, read = CliportEpisodes(write_episode(tmp_path / "a.npz")), []
+    monkeypatch.setattr(cliport, "read_episode", lambda file: read.append(file) or read_episode(file))
+    episodes.episode(0)
+    assert read == [tmp_path / "a.npz"]
