@@ -23,7 +23,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from experiments.report.page import Entry, Index, Tone
+from experiments.report.page import Entry, Tone, environment
 from experiments.report.results import Checkpoint, Results
 from experiments.report.tables import Cell, Table, TableRow
 from experiments.study.run import OutputFolder, Run, Study, StudyArgs, UsageError, exit_in_a_line
@@ -149,17 +149,11 @@ def write_pages(
         results = read_results(folder.path / study.name)
         entries.append(entry_of(study, outcomes[study.name], results))
         parts += [to_markdown(study, results)] if results else []
-    index = Index(
-        title="What was measured",
-        text="Every study has a page, which opens offline: tables with 95 % intervals, plots, clips of the best and "
-        "worst cases, and the command that gives the same figures again.",
-        entries=entries,
-        checkpoint=weights,
-        command=replace(args, only=(), fresh=False).command("all"),
-        quick=args.quick,
-    )
+    command = replace(args, only=(), fresh=False).command("all")
+    index = environment().get_template("index.html.j2")
+    page = index.render(entries=entries, checkpoint=weights, command=command, quick=args.quick)
     with folder.fill() as partial:
-        (partial / "index.html").write_text(index.to_html(), encoding="utf-8")
+        (partial / "index.html").write_text(page, encoding="utf-8")
         (partial / "summary.md").write_text("\n".join(parts), encoding="utf-8")
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from experiments.report.page import CardSpec, Clips, Figure, Section
-from experiments.report.plots import curve_plot, heat_map, plot_table
+from experiments.report.plots import curve_plot, plot_table
 from experiments.report.results import Results
 from experiments.report.rows import Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
@@ -30,10 +30,10 @@ from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_sec
 from experiments.study.judge import Verdicts, find_things, first_frame, judge, stack, trace
 from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
+from experiments.study.predictions import hold_last
 from experiments.study.run import Found, FullArgs, Part, Run, Study, start
 from experiments.study.scenes import LONG_GOALS, StudyScene, play_expert, sample_scene, study_scenes
 from planning import RELATIONS, THRESHOLDS, AppearanceGrounder, Instruction
-from textocvp import WorldModel
 
 VARIANTS = 3
 SPLIT = "controllability"
@@ -126,40 +126,9 @@ class PredictedScene:
             texts=tuple(texts),
             verdicts={method: stack(parts) for method, parts in judged.items()},
             imagined_TV=imagined[0].distance_Bt.T.numpy(),
-            true_TV=np.stack(_same_length([one.distance_Bt[0].numpy() for one in true]), axis=1),
+            # An episode that is over sooner ends in a block that lies still.
+            true_TV=np.stack([hold_last(one.distance_Bt[0].numpy(), HORIZON + 1) for one in true], axis=1),
         )
-
-
-@dataclass(frozen=True)
-class ReadAttention:
-    """A unit of work: the attention of the named block and bowl, the arm and another bowl; None if not found."""
-
-    scene: StudyScene
-    variant: int
-    seed: int
-
-    def run(self, worker: Worker) -> Figure | None:
-        """Imagine the scene once more; a map of slots and words, mean over layers, heads and frames."""
-        model = worker.world_model
-        if not isinstance(model, WorldModel):
-            return None
-        sampled = sample_scene(worker.environment(self.scene), self.scene, VARIANTS)
-        text, seen = sampled.texts[self.variant], sampled.observation["rgb"]
-        rollout = model.rollout(seen, [text], horizon=HORIZON, seed=self.seed, attention=True)
-        named = Instruction.parse(text).things
-        grounding = find_things(
-            rollout, AppearanceGrounder.from_info(sampled.info), [Instruction.parse(text)]
-        )
-        if rollout.attention is None or grounding is None or not set(named) <= set(grounding.things):
-            return None
-        slots = {f"{thing.color} {thing.kind} (named)": grounding.things[thing] for thing in named}
-        slots["arm"] = grounding.arm
-        others = [thing for thing in grounding.things if thing not in named and thing.kind == "bowl"]
-        slots |= {f"{thing.color} bowl": grounding.things[thing] for thing in others[:1]}
-        words = model.words(text)
-        weights_KL = rollout.attention[0].mean(dim=(0, 1, 2))[:, : len(words)]
-        weights = np.stack([weights_KL[list(its)].mean(0).numpy() for its in slots.values()])
-        return heat_map("attention.png", weights, list(slots), words, label="attention to words")
 
 
 def units(run: Run) -> dict[str, Part]:
@@ -179,16 +148,14 @@ def units(run: Run) -> dict[str, Part]:
         "closed loop": Part([one for one in episodes if one.scene.steps == 1], 0.25),
         "long goals": Part([one for one in episodes if one.scene.steps > 1], 0.9),
         "pictures": Part(seconds=0.5, count=4 * sizes.clips),
-        "attention": Part(seconds=0.3, count=1),
     }
 
 
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
-    """Pictures of the best and worst predicted cases and of the closed loop; attention of the best case."""
+    """Pictures of the best and worst predicted cases and of the closed loop."""
     count, seed = run.sizes.clips, run.args.seed
     predicted = predicted_clips(found["predicted study"], seed, count)
-    best = [ReadAttention(clip.scene, clip.variant, seed) for clip in predicted[:1]]
-    return {"pictures": [*predicted, *episode_clips(_loop(found), column_of, count)], "attention": best}
+    return {"pictures": [*predicted, *episode_clips(_loop(found), column_of, count)]}
 
 
 def predicted_clips(outcomes: Sequence[PredictedOutcome], seed: int, count: int) -> list[PredictionClip]:
@@ -270,12 +237,6 @@ def column_of(episode: LoopEpisode) -> str:
     return list(PREDICTED_PLACES)[episode.variant] if split == SPLIT else OTHER_SPLITS[split]
 
 
-def _same_length(curves: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Shorter curves held at their last value."""
-    length = max(map(len, curves))
-    return [np.pad(curve, (0, length - len(curve)), mode="edge") for curve in curves]
-
-
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 PREDICTED_TABLE = TableSpec(
@@ -329,7 +290,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     pictures = found["pictures"]
     imagined = [clip for clip in pictures if clip.name.startswith("predicted")]
     acted = [clip for clip in pictures if not clip.name.startswith("predicted")]
-    sections = [
+    return [
         Section(
             "Predicted: does the imagined scene obey the sentence?",
             "Each scene is imagined with its own instruction and with three that name another bowl. A rollout "
@@ -367,19 +328,13 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             [Clips(acted)],
         ),
     ]  # fmt: skip
-    text = "Text-to-slot attention of the first best case, mean over layers, heads and frames."
-    shown = [
-        Section("Which words a slot attends to", text, [figure]) for figure in found["attention"] if figure
-    ]
-    return [*sections, *shown]
 
 
 def _distance_plot(outcomes: Sequence[PredictedOutcome]) -> Figure:
     curves = []
     for title, name in (("imagined", "imagined_TV"), ("true frames", "true_TV")):
         # Without the observed frame.
-        its = [column[1:] for outcome in outcomes for column in getattr(outcome, name).T]
-        distances = np.stack(_same_length(its))
+        distances = np.stack([column[1:] for outcome in outcomes for column in getattr(outcome, name).T])
         distances[~np.isfinite(distances)] = FARTHEST  # what cannot be seen is farther off than what can
         low, middle, high = np.quantile(distances, (0.1, 0.5, 0.9), axis=0)
         curves.append((title, np.stack([middle, low, high], axis=1)))

@@ -257,9 +257,9 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     for title, value in seconds(found).get(OURS[0], {}).items():
         figures.append(Row(OURS[0], *COLUMNS[title], "seconds", value, value, value, 1))
     caption = "Dots with 95 % intervals over scenes; all but the first carry out one plan."
-    plotted = {"caption": caption, "lines": PLOTTED}
-    success = plot_table("success.png", GOALS, figures, label="whole goal reached", **plotted)  # type: ignore[arg-type]
-    parts = plot_table("subgoals.png", PARTS, figures, label="share of sub-goals reached", **plotted)  # type: ignore[arg-type]
+    success = plot_table(
+        "success.png", GOALS, figures, label="whole goal reached", caption=caption, lines=PLOTTED
+    )
     return [
         Section(
             "Whole goals",
@@ -275,7 +275,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         Section(
             "Parts of goals",
             "How much of the goal holds at the end, by the simulator; nothing of it holds at the start.",
-            [PARTS.table(figures), parts, DETAILS.table(figures)],
+            [PARTS.table(figures), DETAILS.table(figures)],
         ),
         Section(
             "Planned beside executed",

@@ -11,7 +11,7 @@ from typing import Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from experiments.report.results import Checkpoint, Results
+from experiments.report.results import Results
 from experiments.report.tables import DASH, Cell, Column, Line, Table
 
 AGAIN = "The seed fixes scenes, instructions and slots: everything in results.json but the seconds comes out the same."
@@ -141,22 +141,6 @@ class Entry:
     figures: Sequence[tuple[str, str]] = ()  # a few headline figures, (name, value as text)
     report: str = ""  # where its page is, relative to the index; empty if there is none
     problem: str = ""  # what went wrong, or empty
-
-
-@dataclass(frozen=True)
-class Index:
-    """The page that links every report."""
-
-    title: str  # its heading
-    text: str  # a sentence below
-    entries: Sequence[Entry]  # the studies, in order
-    checkpoint: Checkpoint  # that they measured
-    command: str  # what to type to get them again
-    quick: bool  # whether these were quick runs
-
-    def to_html(self) -> str:
-        """The page; only the links to the reports lead out of it."""
-        return environment().get_template("index.html.j2").render(index=self)
 
 
 def _save(path: Path, data: bytes) -> None:

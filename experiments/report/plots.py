@@ -92,10 +92,9 @@ def interval_plot(
             offset = 0.0 if len(series) == 1 else (i / (len(series) - 1) - 0.5) * 0.56
             color = theme.series[(i if one.color is None else one.color) % len(theme.series)]
             measured = [(g + offset, *point) for g, point in enumerate(one.points) if point is not None]
-            for y, _, low, high in measured:
-                axes.plot([low, high], [y, y], color=color, linewidth=2, alpha=0.55, solid_capstyle="round")
             if measured:
-                ys, values, *_ = zip(*measured, strict=True)
+                ys, values, lows, highs = zip(*measured, strict=True)
+                axes.hlines(ys, lows, highs, color=color, linewidth=2, alpha=0.55, capstyle="round")
                 axes.plot(
                     values, ys, "o", markersize=6, color=color, markeredgewidth=1.6, label=one.label,
                     markerfacecolor=theme.page if one.hollow else color, clip_on=False, zorder=3,
@@ -108,14 +107,10 @@ def interval_plot(
             axes.set_xlim(*limits)
         axes.set_xlabel(label)
         axes.grid(axis="x")
-        columns = len(series) if len(series) < 5 else 3
         axes.legend(
-            loc="lower center",
-            ncols=columns,
-            bbox_to_anchor=(0.5, 1.01),
-            handletextpad=0.2,
-            columnspacing=1.4,
-        )
+            loc="lower center", ncols=len(series) if len(series) < 5 else 3, bbox_to_anchor=(0.5, 1.01),
+            handletextpad=0.2, columnspacing=1.4,
+        )  # fmt: skip
 
     alt = "; ".join(
         f"{one.label}: " + ", ".join(f"{g} {p[0]:.2f}" for g, p in zip(groups, one.points, strict=True) if p)

@@ -223,6 +223,11 @@ class Column:
     percent: bool = False  # shown as `6.4 %`
     paper: str = ""  # metric of the paper's figures, where that is another
 
+    @property
+    def scale(self) -> int:
+        """What a figure is multiplied by in a plot."""
+        return 100 if self.percent else 1
+
 
 def columns(metric: str, places: Mapping[str, tuple[str, str]], digits: int = 2) -> tuple[Column, ...]:
     """A column for each place, all of one metric. Places: title -> (split, variant)."""
@@ -249,46 +254,42 @@ class TableSpec:
         lines = []
         for line in self.lines:
             note = "absent; the last section says why" if line.key in missing else line.note
-            cells = [self._cell(found, line, column) for column in self.columns]
+            cells = [
+                Cell.of(found.get(_key(line, c)), c.digits if line.digits is None else line.digits, c.percent)
+                for c in self.columns
+            ]
             lines.append(TableRow(line.name, cells, line.kind, note))
-            if (paper := line.paper) is not None:
-                quoted = [self._quoted(paper, line, column) for column in self.columns]
-                if any(value is not None for value in quoted):
-                    cells = [
-                        Cell(DASH if v is None else as_percent(v) if c.percent else f"{v:.{c.digits}f}")
-                        for v, c in zip(quoted, self.columns, strict=True)
-                    ]
-                    lines.append(TableRow(paper.label, cells, "paper", paper.note))
+            quoted = [self._quoted(line, column) for column in self.columns]
+            if line.paper is not None and any(value is not None for value in quoted):
+                cells = [
+                    Cell(DASH if v is None else as_percent(v) if c.percent else f"{v:.{c.digits}f}")
+                    for v, c in zip(quoted, self.columns, strict=True)
+                ]
+                lines.append(TableRow(line.paper.label, cells, "paper", line.paper.note))
         return Table(self.title, [column.title for column in self.columns], lines, self.caption)
 
     def points(self, rows: Iterable[Row], line: Line) -> list[tuple[float, float, float] | None]:
         """(value, low, high) of a line at each column, in percent where the column is; None without a row."""
         found = by_key(rows)
-        points: list[tuple[float, float, float] | None] = []
-        for column in self.columns:
-            row = found.get(_key(line, column))
-            scale = 100 if column.percent else 1
-            points.append(None if row is None else (scale * row.value, scale * row.low, scale * row.high))
-        return points
+        return [
+            (c.scale * row.value, c.scale * row.low, c.scale * row.high)
+            if (row := found.get(_key(line, c)))
+            else None
+            for c in self.columns
+        ]
 
     def paper_points(self, line: Line) -> list[tuple[float, float, float] | None]:
         """The same for the paper's figures, which have no interval."""
-        if line.paper is None:
-            return [None] * len(self.columns)
-        scaled = [
-            None if (v := self._quoted(line.paper, line, c)) is None else v * (100 if c.percent else 1)
+        return [
+            None if (v := self._quoted(line, c)) is None else (c.scale * v,) * 3  # type: ignore[misc]
             for c in self.columns
         ]
-        return [None if v is None else (v, v, v) for v in scaled]
-
-    def _cell(self, found: Mapping, line: Line, column: Column) -> Cell:
-        digits = column.digits if line.digits is None else line.digits
-        return Cell.of(found.get(_key(line, column)), digits, column.percent)
 
     @staticmethod
-    def _quoted(paper: Paper, line: Line, column: Column) -> float | None:
+    def _quoted(line: Line, column: Column) -> float | None:
+        """The paper's figure, where it has one."""
         metric = column.paper or line.metric or column.metric
-        return paper.figures.get((column.split, column.variant, metric))
+        return line.paper.figures.get((column.split, column.variant, metric)) if line.paper else None
 
 
 def _key(line: Line, column: Column) -> tuple[str, str, str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -117,11 +116,8 @@ def episode_clips(
     ours = [(column_of(o.episode), o) for o in outcomes if o.episode.method in methods]
     ours.sort(key=lambda one: -one[1].episode.scene.steps)
     failed = [(column, o) for column, o in ours if not o.success]
-    before = Counter[str]()
-    turns = []
-    for column, _ in failed:
-        turns.append(before[column])
-        before[column] += 1
+    places = [column for column, _ in failed]
+    turns = [places[:i].count(column) for i, column in enumerate(places)]
     chosen = [failed[i] for i in np.argsort(turns, kind="stable")][:count]
     chosen += [one for one in ours if one[1].success][: 2 * count - len(chosen)]
     return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]

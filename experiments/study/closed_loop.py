@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 
@@ -67,11 +69,8 @@ class LoopEpisode:
             played = play_expert(env, sampled, self.variant, order)
             return LoopOutcome(self, text, played.success, played.gained, None, order)
         result = self.pursue(worker, sampled)
-        ranked_first = None
-        if self.acts.kind != "control" and len(goal.instructions) == 1:
-            ranked_first = (
-                bool(result.attempts) and result.attempts[0].plan.best.instructions == goal.instructions
-            )
+        ranks = self.acts.kind != "control" and len(goal.instructions) == 1
+        first = [attempt.plan.best.instructions for attempt in result.attempts[:1]]
         return LoopOutcome(
             episode=self,
             text=text,
@@ -79,7 +78,7 @@ class LoopEpisode:
             gained=round(result.gained, 6),
             believes_reached=result.believes_reached,
             instructions=tuple(attempt.instruction.text for attempt in result.attempts),
-            ranked_first=ranked_first,
+            ranked_first=first == [goal.instructions] if ranks else None,
             planning_seconds=result.planning_seconds if result.attempts else None,
             error=result.error,
         )
@@ -107,12 +106,11 @@ def planning_seconds(
     outcomes: Sequence[LoopOutcome], column_of: Callable[[LoopEpisode], str]
 ) -> dict[str, dict[str, float]]:
     """Mean seconds of a plan, method -> column -> seconds. Not for results.json, which must come out the same again."""
-    seconds: dict[str, dict[str, list[float]]] = {}
+    seconds: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for o in outcomes:
         if o.planning_seconds is not None:
-            its = seconds.setdefault(o.episode.method, {})
-            its.setdefault(column_of(o.episode), []).append(o.planning_seconds)
+            seconds[o.episode.method][column_of(o.episode)].append(o.planning_seconds)
     return {
-        method: {title: round(float(np.mean(its)), 3) for title, its in table.items()}
+        method: {title: round(fmean(its), 3) for title, its in table.items()}
         for method, table in seconds.items()
     }

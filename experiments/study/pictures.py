@@ -19,9 +19,9 @@ from experiments.study.scenes import StudyScene, sample_scene
 from planning import Instruction, Thing
 from textocvp.inputs import ForeignPictureWarning
 from textocvp.metrics import overlaps
+from textocvp.training.evaluate_predictor import PIXEL, REACHED
 from textocvp.training.light import jpeg
 
-REACHED_PX = 6  # of 64: a block that ends closer than this to where the bowl's slot started is at it
 FOUND = 0.25  # IoU above which a slot holds a thing
 WOOD = (139, 101, 66)  # RGB
 
@@ -99,10 +99,9 @@ class ChangedScene:
         label_of = {Thing(item["color"], item["kind"]): item["label"] for item in sampled.info["objects"]}
         seen_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
         block, bowl = (_best_slot(seen_HW, labels_HW, label_of[one]) for one in (asked.thing, asked.target))
-        places_TK2 = rollout.positions[0].cpu() * 64 / rollout.image_size[0]
-        reached = min(block, bowl) >= 0 and bool(
-            (places_TK2[-1, block] - places_TK2[0, bowl]).norm() < REACHED_PX
-        )
+        places_TK2 = rollout.positions[0].cpu() * 64 / rollout.image_size[0]  # pixels of 64
+        away = float((places_TK2[-1, block] - places_TK2[0, bowl]).norm())
+        reached = min(block, bowl) >= 0 and away < REACHED / PIXEL
         warned = any(issubclass(one.category, ForeignPictureWarning) for one in said)
         return ChangedOutcome(self.scene, self.change, reached, warned)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import shlex
 import sys
 import tempfile
 import time
@@ -78,16 +79,12 @@ class StudyArgs:
             if one.name not in ("out", "workers", "seed") and value != one.default:
                 option = "--" + one.name.replace("_", "-")
                 values = value if isinstance(value, tuple) else (value,)
-                words += [option] if value is True else [f"{option} {_quoted(str(v))}" for v in values]
+                words += [option] if value is True else [f"{option} {shlex.quote(str(v))}" for v in values]
         return [*words, f"--seed {self.seed}"]
 
     def command(self, study: str) -> str:
         """What to type for the same figures. `study` is the name of its file, without `.py`."""
         return " ".join([f"python experiments/{study}.py", *self.options()])
-
-
-def _quoted(text: str) -> str:
-    return f'"{text}"' if " " in text else text
 
 
 @dataclass

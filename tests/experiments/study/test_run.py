@@ -46,7 +46,7 @@ def test_the_command_names_what_changes_figures_and_nothing_else() -> None:
     args = ScenesArgs(checkpoint="mine", quick=True, seed=3, scenes=7, model=("ours, 40 frames=a", "MAGE=b"))
     assert args.command("tiny") == (
         "python experiments/tiny.py --checkpoint mine --quick "
-        '--model "ours, 40 frames=a" --model MAGE=b --scenes 7 --seed 3'
+        "--model 'ours, 40 frames=a' --model MAGE=b --scenes 7 --seed 3"
     )
 
 
