@@ -155,9 +155,9 @@ def test_a_part_is_chosen_by_its_kind_and_trained(name, preset, settings, part, 
 def test_a_planner_acts_and_is_a_row_of_the_studies() -> None:
     names = example("planner")
     env = gym.make("PutBlockInBowl-v0", control="primitive")
-    result = run_episode(env, names["LiteralPlanner"](WorldModel.from_pretrained()), seed=20_000_000)
+    result = run_episode(env, names["HastyPlanner"](WorldModel.from_pretrained()), seed=20_000_000)
     assert result.success and result.steps == 1
-    assert METHODS["literal"].acts and "literal" in [line.key for line in lines(["ours", "literal"])]
+    assert METHODS["hasty"].acts and "hasty" in [line.key for line in lines(["ours", "hasty"])]
 
 
 def test_a_baseline_is_a_row_and_another_architecture_is_loaded(tmp_path: Path) -> None:
