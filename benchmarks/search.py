@@ -57,7 +57,7 @@ def main(args: Args) -> None:
         seed = val.seed(number)
         observation, info = env.reset(seed=seed, options=val.options(seed))
         ground, goal = AppearanceGrounder.from_info(info), Goal.parse(info["instruction"])
-        film = BeamPlanner(model, depth=1, candidates="scene", one_block_per_bowl=False)
+        film = BeamPlanner(model, depth=1, candidates="scene")
         chosen = film.plan(observation["rgb"], goal, ground).instruction
         same += SearchPlanner(model, depth=1).plan(observation["rgb"], goal, ground).instruction == chosen
         if number >= args.repeats:

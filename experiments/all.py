@@ -31,7 +31,7 @@ from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
 NAMES = (
-    "controllability", "robustness", "prediction", "objects",
+    "controllability", "imagination", "robustness", "prediction", "objects",
     "ablations", "interpretability", "runtime", "long_horizon",
 )  # fmt: skip
 """Every study, in the order in which they are run and shown."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from planning.grounding import Grounder, Grounding, GroundingError
 from planning.language import AnyGoal, Goal, Instruction
-from planning.masks import frame_masks
 from planning.relations import RELATIONS
 from planning.scores import (
     DEFAULT_CRITERION,
@@ -21,7 +20,6 @@ from planning.scores import (
     Score,
     SuccessCriterion,
     Trace,
-    contents,
     measure_rollout,
     unmet,
 )
@@ -128,9 +126,6 @@ class BeamPlanner(_LooksAtMasks):
     criterion: SuccessCriterion = DEFAULT_CRITERION  # says whether it fulfils that instruction
     depth: int | None = None  # instructions in a plan; at most, and by default, as many as do not hold yet
     candidates: Literal["goal", "scene"] = "goal"  # move a thing of the goal, or any thing of the scene
-    # Leave out steps into a bowl in which another block is seen to lie by then: a model that has never seen two blocks
-    # meet in a bowl imagines that both fit.
-    one_block_per_bowl: bool = True
     beam: int = 4  # sequences that are kept after each step; 0 keeps all (exhaustive)
     horizon: int = 24  # frames to imagine for each step
     stride: int = 3  # of the frames that are decoded and scored; the last ones always are
@@ -149,7 +144,12 @@ class BeamPlanner(_LooksAtMasks):
         branches, kept, starts = [_Branch()], [0], parsed
         traces: list[Trace] = []  # one for each wanted instruction, of all branches
         for done in range(depth):
-            steps = self._steps([branches[i] for i in kept], allowed, starts, grounding)
+            steps = [
+                (row, one)
+                for row, branch in enumerate(branches[i] for i in kept)
+                for one in allowed
+                if one.thing not in {done.thing for done in branch.instructions}
+            ]
             rows, texts = [row for row, _ in steps], [one.text for _, one in steps]
             starts = starts.select(rows)
             rollout = self.world_model.rollout(starts, texts, horizon=self.horizon, seed=self.seed)
@@ -174,22 +174,6 @@ class BeamPlanner(_LooksAtMasks):
         ranking = tuple(Candidate(branches[i].instructions, scores[i], bool(reaches_B[i])) for i in ranked)
         rollouts = tuple(batch.select(row) for batch, row in branches[ranked[0]].imagined)
         return Plan(ranking, rollouts, grounding, perf_counter() - began)
-
-    def _steps(
-        self, kept: Sequence[_Branch], allowed: Sequence[Instruction], starts: Rollout, grounding: Grounding
-    ) -> list[tuple[int, Instruction]]:
-        """What may come next: the row of `starts` and of `kept`, and an instruction."""
-        steps = [
-            (row, one)
-            for row, branch in enumerate(kept)
-            for one in allowed
-            if one.thing not in {done.thing for done in branch.instructions}
-        ]
-        if not self.one_block_per_bowl:
-            return steps
-        inside = [contents(masks_KHW, grounding) for masks_KHW in frame_masks(starts, -1)]
-        free = [(row, one) for row, one in steps if inside[row].get(one.target, set()) <= {one.thing}]
-        return free or steps  # should no bowl have room, trying is better than giving up
 
     def _scores(self, traces: Sequence[Trace], count: int) -> list[float]:
         """One score a sequence: the mean over the `count` instructions of the goal that it fulfils best."""

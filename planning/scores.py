@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from planning.grounding import Grounding
-from planning.language import Goal, Instruction, Thing
+from planning.language import Goal, Instruction
 from planning.masks import Bools, contact_distance, frame_masks
 from planning.relations import RELATIONS, THRESHOLDS, Thresholds
 
@@ -39,15 +39,6 @@ def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instructio
     """
     masks_KHW = frame_masks(parsed, 0)[0]
     return tuple(one for one in goal.instructions if not holds(masks_KHW, grounding, one))
-
-
-def contents(masks_KHW: Bools, grounding: Grounding) -> dict[Thing, set[Thing]]:
-    """The things that lie in each target of the relation `in`, by the bool masks (K, H, W) of one frame."""
-    inside: dict[Thing, set[Thing]] = {}
-    for one in grounding.instructions("in"):
-        if holds(masks_KHW, grounding, one):
-            inside.setdefault(one.target, set()).add(one.thing)
-    return inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,9 +63,7 @@ def _best(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> P
     if len(goal.instructions) > 1:
         return BeamPlanner(model, horizon=HORIZON, seed=seed)
     # One step: any sentence about the scene is a candidate, not only those that the goal asks for.
-    return BeamPlanner(
-        model, depth=1, candidates="scene", one_block_per_bowl=False, horizon=HORIZON, seed=seed
-    )
+    return BeamPlanner(model, depth=1, candidates="scene", horizon=HORIZON, seed=seed)
 
 
 def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:

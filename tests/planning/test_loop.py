@@ -80,7 +80,7 @@ def oracle_for(env: gym.Env[Any, Any], seed: int, options: dict[str, Any] | None
 
 
 def one_step(world_model: OracleWorldModel) -> BeamPlanner:
-    return BeamPlanner(world_model, depth=1, candidates="scene", one_block_per_bowl=False)
+    return BeamPlanner(world_model, depth=1, candidates="scene")
 
 
 @pytest.mark.parametrize("seed", range(5))
