@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
+import json
 import os
 import shlex
 import sys
@@ -10,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -275,6 +277,7 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
     planned = study.units(this)
     found: dict[str, list[Any]] = {part: [] for part in planned}
     seeds: dict[str, list[int]] = {"slots": [this.args.seed]}
+    manifest = scenes_manifest([unit for part in planned.values() for unit in part.units])
     kept = KeptWork(this.folder.path / "unfinished.pickle", this.identity)
     began = time.monotonic() - kept.seconds
     expected = {name: (len(part.units) or part.count, part.seconds) for name, part in planned.items()}
@@ -303,11 +306,13 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
         rows = list(study.rows(this, found))
         hashes = {f"checkpoint of {model.key}": model.sha256 for model in this.models}
         versions = {**package_versions(), **hashes, **study.versions(this)}
+        if manifest:
+            versions["scenes.json"] = hashlib.sha256(manifest.encode()).hexdigest()
         seconds = round(time.monotonic() - began, 1)
         results = Results(
             study.name, this.checkpoint, versions, seeds, this.args.quick, seconds, rows, this.headline(rows)
         )
-        _write(this, results, found)
+        _write(this, results, found, manifest)
         done = True
     finally:
         kept.close(done=done)
@@ -336,7 +341,7 @@ def exit_in_a_line(interrupted: str) -> Iterator[None]:
         sys.exit(interrupted)
 
 
-def _write(this: Run, results: Results, found: Found) -> None:
+def _write(this: Run, results: Results, found: Found, manifest: str) -> None:
     study = this.study
     cards = study.cards(this, results) if callable(study.cards) else study.cards
     filled = [card.fill(results) if isinstance(card, CardSpec) else card for card in cards]
@@ -345,8 +350,18 @@ def _write(this: Run, results: Results, found: Found) -> None:
     with this.folder.fill() as partial:
         report.write(partial)
         (partial / "identity.txt").write_text(this.identity + "\n", encoding="utf-8")
-        for name, text in study.files(this, found).items():
+        named = {"scenes.json": manifest} if manifest else {}
+        for name, text in {**named, **study.files(this, found)}.items():
             (partial / name).write_text(text, encoding="utf-8")
+
+
+def scenes_manifest(units: Sequence[Unit[Any]]) -> str:
+    """Every scene of some units, once, a line each: with it the environments build the same scenes again."""
+    scenes = [
+        scene for unit in units for scene in getattr(unit, "scenes", None) or [getattr(unit, "scene", None)]
+    ]
+    lines = dict.fromkeys(json.dumps(asdict(scene), default=str) for scene in scenes if scene is not None)
+    return "[\n" + ",\n".join(sorted(lines)) + "\n]\n" if lines else ""
 
 
 def _note_seeds(seeds: dict[str, list[int]], part: str, units: Sequence[Unit[Any]]) -> None:

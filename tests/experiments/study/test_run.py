@@ -1,5 +1,6 @@
 """How a study is run: its command line, what it writes, and how one that was interrupted goes on."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -87,7 +88,11 @@ def test_everything_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "identity.txt",
         "report.html",
         "results.json",
+        "scenes.json",
     ]
+    manifest = (tmp_path / "out" / "scenes.json").read_bytes()
+    assert results.versions["scenes.json"] == hashlib.sha256(manifest).hexdigest()
+    assert [scene["seed"] for scene in json.loads(manifest)] == list(range(6))
     shown = capsys.readouterr().out
     assert "draws: 6/6" in shown and "again: 2/2" in shown and f"{results.rows[0].value:.2f}" in shown
     assert tiny(tmp_path)[1] == ran * 2  # a study that is done runs again when it is asked to
