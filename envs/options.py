@@ -98,12 +98,11 @@ def read_scenes(scenes: Scenes) -> tuple[tuple[int, dict[str, Any]], ...]:
         ValueError: when it is no such list; the options are for `read_options` to check.
     """
     if isinstance(scenes, str | os.PathLike):
+        path = Path(scenes)
         try:
-            scenes = json.loads(Path(scenes).read_text(encoding="utf-8"))
+            scenes = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise ValueError(
-                f"{os.fspath(scenes)} is not a JSON file with a list of scenes: {error}"
-            ) from None
+            raise ValueError(f"{path} is not a JSON file with a list of scenes: {error}") from None
     if not isinstance(scenes, Sequence) or isinstance(scenes, str) or not scenes:
         raise ValueError(
             f"scenes must be a list of at least one seed or mapping of reset options, not {scenes!r}"

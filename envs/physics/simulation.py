@@ -273,11 +273,9 @@ def _connect(gui: bool) -> Bullet:
 def _opens_windows(display: str) -> bool:
     """Whether PyBullet can open a window there, tried in a process that it may end."""
     code = "import pybullet; raise SystemExit(pybullet.connect(pybullet.GUI) < 0)"
-    command = [sys.executable, "-c", code]
+    command, there = [sys.executable, "-c", code], {**os.environ, "DISPLAY": display}
     try:
-        tried = subprocess.run(
-            command, env={**os.environ, "DISPLAY": display}, capture_output=True, timeout=DISPLAY_SECONDS
-        )
+        tried = subprocess.run(command, env=there, capture_output=True, timeout=DISPLAY_SECONDS)
     except subprocess.TimeoutExpired:
         return False
     return tried.returncode == 0
