@@ -6,9 +6,11 @@ Gymnasium; without an import, ``gymnasium.make("envs:PutBlockInBowl-v0")`` does 
 
 from gymnasium.envs.registration import register
 
+from envs.dataset import scene_of
 from envs.expert import Expert
 from envs.tabletop import TabletopEnv
 from envs.tasks import TASKS
+from envs.video import RecordVideo
 
 # The environments truncate by themselves, because their limits depend on the control mode.
 for env_id, task in (
@@ -18,4 +20,4 @@ for env_id, task in (
 ):
     register(id=env_id, entry_point="envs.tabletop:TabletopEnv", kwargs={"task": task})
 
-__all__ = ["TASKS", "Expert", "TabletopEnv"]
+__all__ = ["TASKS", "Expert", "RecordVideo", "TabletopEnv", "scene_of"]

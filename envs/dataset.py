@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from envs.physics.ur5 import PACKAGE, find_package
 from envs.scene import MAX_OBJECTS
 from envs.scenes import Setup, make_setup
 from envs.splits import SPLITS
-from envs.tabletop import TabletopEnv
+from envs.tabletop import Observation, TabletopEnv
 from envs.tasks import TASKS, Question
 from envs.tasks.rearrange import Rearrange, Supports, with_supports
 
@@ -71,6 +72,14 @@ class EpisodeConfig:
             del arguments[name]
         return TabletopEnv(self.task, record_frames=True, **arguments)
 
+    def options(self, seed: int) -> dict[str, Any]:
+        """The `reset` options of the scene with this seed."""
+        split = SPLITS[self.split]
+        if self.policy == "expert":
+            return split.options(seed)
+        arm = "random" if np.random.default_rng([seed, 2]).random() < split.moved_arm else "home"
+        return {"n_objects": split.n_objects, "color_split": split.color_split, "arm_start": arm}
+
     @property
     def setup(self) -> Setup:
         """What is alike in all scenes."""
@@ -87,6 +96,7 @@ class RecordedEpisode:
     questions: tuple[Question, ...]
     success: bool
     factors: dict[str, Any]  # values of this scene's factors
+    options: dict[str, Any]  # of `reset`
     arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
     sentence: int = 0  # its number in its scene
     supports: tuple[Supports, Supports] = ((), ())  # before and after it, by object, with "any-sentence"
@@ -112,9 +122,8 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
     split, task, expert = SPLITS[config.split], env.task, Expert(env)
     assert isinstance(task, Rearrange)
     seed = split.seed(scene)
-    rng = np.random.default_rng([seed, 2])
-    arm = "random" if rng.random() < split.moved_arm else "home"
-    options = {"n_objects": split.n_objects, "color_split": split.color_split, "arm_start": arm}
+    rng, options = np.random.default_rng([seed, 2]), config.options(seed)
+    rng.random()  # has decided where the arm starts
     _, info = env.reset(seed=seed, options=options)
     allowed, objects = task.sentences(env.scene.objects, split.color_split), env.scene.objects
     for sentence in range(config.sentences):
@@ -128,6 +137,7 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
             questions=task.questions(with_supports(objects, before)),
             success=task.relation(pair).fulfilled(env.world, env.robot, pair),
             factors=info["factors"],
+            options=options,
             arrays=_arrays([first, info]),
             sentence=sentence,
             supports=(before, info["supports"]),
@@ -136,9 +146,9 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
 
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
     """Let the expert play episode number ``episode`` of the split; see `record_episodes`."""
-    split = SPLITS[config.split]
-    seed = split.seed(episode)
-    _, info = env.reset(seed=seed, options=split.options(seed))
+    seed = SPLITS[config.split].seed(episode)
+    options = config.options(seed)
+    _, info = env.reset(seed=seed, options=options)
     infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
     return RecordedEpisode(
         seed=seed,
@@ -147,8 +157,46 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
         questions=env.task.questions(env.scene.objects),
         success=bool(infos[-1]["is_success"]),
         factors=info["factors"],
+        options=options,
         arrays=_arrays(infos),
     )
+
+
+def scene_of(path: str | os.PathLike[str], index: int) -> tuple[TabletopEnv, Observation, dict[str, Any]]:
+    """An environment in the state in which an episode of a collected file begins, and what `reset` gives there.
+
+    Its first frame is the episode's, bit for bit. Where other sentences came before in the scene, they are played.
+
+    Raises:
+        IndexError: when the file has no such episode.
+        ValueError: when `envs.collect` did not write it, or wrote another format version.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            if (file.attrs.get("format"), file.attrs.get("format_version")) != (FORMAT, FORMAT_VERSION):
+                raise ValueError(f"{path} is no episode file of format version {FORMAT_VERSION}")
+            rows, values = file["episode"], json.loads(file.attrs["config"])
+            config = EpisodeConfig(**values | {"factors": Factors(**values["factors"])})
+            count = len(rows["length"])
+            if not -count <= index < count:
+                raise IndexError(f"{path} has episodes 0 to {count - 1}, not {index}")
+            seed = int(rows["seed"][index % count])
+            sentence = int(rows["sentence"][index % count]) if "sentence" in rows else 0
+            # Files of the first days have no options, but the same code drew them.
+            stored = (
+                json.loads(rows["options"].asstr()[index % count])
+                if "options" in rows
+                else config.options(seed)
+            )
+    except (OSError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} was not written by envs.collect, or is damaged: {error}") from error
+    env = config.make()
+    observation, info = env.reset(seed=seed, options=stored)
+    if sentence:
+        scene = seed - SPLITS[config.split].first_seed
+        list(islice(record_sentences(env, config, scene), sentence))
+        observation, info = env._observe(), env._info()
+    return env, observation, info
 
 
 def _named(info: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -201,6 +249,7 @@ _COLUMNS: _Columns = {
     "objects": (_TEXT, lambda episode: json.dumps(episode.objects)),
     "questions": (_TEXT, lambda episode: json.dumps([each._asdict() for each in episode.questions])),
     "factors": (_TEXT, lambda episode: json.dumps(episode.factors)),
+    "options": (_TEXT, lambda episode: json.dumps(episode.options)),
     "success": ("?", lambda episode: episode.success),
 }
 _SUPPORTS = np.dtype(("i1", (MAX_OBJECTS,)))
@@ -227,7 +276,8 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
                     names = [*_ARRAYS, *(f"episode/{name}" for name in _columns(config))]
-                    _append(file, {name: source[name][:] for name in names})
+                    # A file that was begun before there were `options` goes on without.
+                    _append(file, {name: source[name][:] for name in names if name in file})
 
 
 @contextmanager

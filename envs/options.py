@@ -1,10 +1,13 @@
-"""``reset(options=...)``, checked as a whole before anything changes."""
+"""``reset(options=...)`` and fixed lists of scenes, checked as a whole before anything changes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import os
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +27,8 @@ _OF_GOAL = ("family", "goal_layout")
 CARRIED_MARGIN = 0.1  # how far inside the spawn area a carried block starts, so that the arm reaches it
 
 OPTIONS = ("layout", "instruction", "arm_start", "factors")  # of every task, which adds its `scene_options`
+
+Scenes = Sequence[int | Mapping[str, Any]] | str | os.PathLike[str]  # as users give a list of scenes
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,51 @@ class ResetOptions:
 def _holding_tip(item: ObjectSpec, sizes: Sizes) -> Point:
     """Where the tip holds a block."""
     return item.x, item.y, (item.height or 0.0) + sizes.block / 2
+
+
+def override(given: Mapping[str, Any], options: Any, task: Task) -> Any:
+    """``options`` over those ``given`` before; a layout replaces the description of a random scene."""
+    if not isinstance(options or {}, Mapping):
+        return options  # for `read_options` to refuse
+    options = options or {}
+    if options.get("layout") is not None:
+        random = set(task.scene_options) - set(_WITH_LAYOUT)
+        given = {name: value for name, value in given.items() if name not in random}
+    return {**given, **options}
+
+
+def read_seed(seed: Any) -> int:
+    """A seed as a Python int; ValueError for what is no whole number of at least 0."""
+    check_range("seed", seed, 0, None, whole=True)
+    return int(seed)
+
+
+def read_scenes(scenes: Scenes) -> tuple[tuple[int, dict[str, Any]], ...]:
+    """Seed and reset options of each scene of a list, or of a JSON file with one.
+
+    A scene is a seed, or a mapping of reset options and `seed`, which is the scene's place in the list by default.
+
+    Raises:
+        ValueError: when it is no such list; the options are for `read_options` to check.
+    """
+    if isinstance(scenes, str | os.PathLike):
+        path = Path(scenes)
+        try:
+            scenes = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} is not a JSON file with a list of scenes: {error}") from None
+    if not isinstance(scenes, Sequence) or isinstance(scenes, str) or not scenes:
+        raise ValueError(
+            f"scenes must be a list of at least one seed or mapping of reset options, not {scenes!r}"
+        )
+    found = []
+    for number, scene in enumerate(scenes):
+        options = dict(scene) if isinstance(scene, Mapping) else {"seed": scene}
+        try:
+            found.append((read_seed(options.pop("seed", number)), options))
+        except ValueError as error:
+            raise ValueError(f"scene {number} of scenes: {error}") from None
+    return tuple(found)
 
 
 def read_options(

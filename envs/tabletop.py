@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Literal, SupportsFloat
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from envs.checks import check_choice, check_range
 from envs.factors import Factors
-from envs.options import read_options
+from envs.options import OPTIONS, ResetOptions, Scenes, override, read_options, read_scenes, read_seed
 from envs.physics.arm import Joints
 from envs.physics.motion import Action, pick_and_place
 from envs.physics.recorder import Recorder
@@ -72,7 +72,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     relation and the two ids; none with a goal picture), `goal_supports` (of a goal picture, or None) and `family` (of
     the scene, or None). With
     ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of `reset`: see
-    `envs.physics.recorder.Recorder`.
+    `envs.physics.recorder.Recorder`. With ``scenes`` also `scene_number` in that list.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -88,6 +88,12 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     `color_split`; or a `layout` with an `instruction` or a `goal_layout` (the arrangement that the goal picture
     shows). Blocks of its layouts may stand on each other where their `position` says so.
 
+    Vectorised environments reset without options: there, give them to the constructor.
+
+    ## Copies
+    A copy, deep copy or pickle has a simulator of its own in the same state, to the last bit: it builds the scene
+    and repeats the actions since the reset. It has no window.
+
     Args:
         scene: "simple" (made easy), "cliport" (CLIPort's table, robot, grays, light and speed, in the paper's
             view) or "varied" (the same with random factors).
@@ -98,7 +104,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         image_size: height and width of the square image, in pixels.
         camera: "close" (a narrow workspace fills the frame) or "paper"; by default the scene's own.
         sizes: "paper" (blocks of 5.8 cm, bowls of 14 cm) or "cliport" (4 cm, 11.4 cm); by default the scene's.
-        factors: ranges of what varies from scene to scene; by default the scene's.
+        factors: ranges of what varies from scene to scene; by default the scene's. Values, as in
+            ``info["factors"]``, are a reset option for every scene.
         object_scale: scales blocks and bowls, 0.5 to 1; at 1 they are the paper's, and 8 of them just fit.
         render_stride: physics steps between two camera frames.
         physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
@@ -107,11 +114,21 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         extras: further observations, of "depth", "segmentation", "proprio".
         place_yaw: whether a primitive has a fifth value.
         record_frames: whether `info` holds all frames of a step.
-        render_mode: "rgb_array", "human" or None.
+        render_mode: "rgb_array" (`render` gives the newest frame), "rgb_array_list" (all frames since the last
+            `render` or `reset`, also those within a primitive), "human" or None.
+        render_size: height and width of what `render` gives, in pixels; by default the image size.
+        scenes: a list of scenes, or a JSON file with one, that resets walk through again and again: seeds, or
+            mappings of reset options and `seed` (by default the scene's number). A reset with a seed goes to the
+            scene of that number, modulo their count, and on from there.
+        **wishes: any other reset option, for every reset that does not say otherwise.
+
+    Raises:
+        ValueError: for values that are not allowed.
+        TypeError: for an argument that there is not.
     """
 
     # Not a ClassVar, because Gymnasium declares it so.
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "rgb_array_list", "human"], "render_fps": 15}  # noqa: RUF012
 
     def __init__(
         self,
@@ -130,7 +147,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
         scene: str = "simple",
         sizes: str | None = None,
-        factors: Factors | None = None,
+        factors: Factors | Mapping[str, Any] | None = None,
+        render_size: int | None = None,
+        scenes: Scenes | None = None,
+        **wishes: Any,
     ) -> None:
         if isinstance(task, str):
             check_choice("task", task, TASKS)
@@ -138,11 +158,20 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.n_pairs = self.task.pairs[0] if n_pairs is None else n_pairs
         check_range("n_pairs", self.n_pairs, *self.task.pairs, whole=True)
         check_choice("control", control, ("primitive", "ee"))
+        if isinstance(factors, Mapping):
+            wishes, factors = wishes | {"factors": factors}, None
+        if unknown := set(wishes) - {*OPTIONS, *self.task.scene_options}:
+            allowed = ", ".join([*OPTIONS, *self.task.scene_options])
+            raise TypeError(
+                f"unexpected argument {min(unknown)!r}; reset options that are arguments: {allowed}"
+            )
         self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         for extra in extras:
             check_choice("extras", extra, EXTRAS)
         check_range("image_size", image_size, 16, 2048, whole=True)
+        self.render_size = image_size if render_size is None else render_size
+        check_range("render_size", self.render_size, 16, 2048, whole=True)
         physics_hz = setup.physics_hz if physics_hz is None else physics_hz
         check_range("physics_hz", physics_hz, 120, 2000, whole=True)
         check_range("render_stride", render_stride, 1, physics_hz // 10, whole=True)
@@ -162,9 +191,17 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.observation_space = observation_space(
             image_size, setup.camera.far, longest, (*self.extras, *("goal_rgb",) * self.task.stacks)
         )
-        self.world = Tabletop(setup, image_size, physics_hz, gui=render_mode == "human")
-        self.robot = Robot(self.world, render_stride)
-        self._recorder = Recorder(self.robot)
+        self._wishes, self._scenes = wishes, None if scenes is None else read_scenes(scenes)
+        self._scene_number, self._next_scene = -1, 0
+        self._read(None)
+        for number, (_, wished) in enumerate(self._scenes or ()):
+            try:
+                self._read(wished)
+            except ValueError as error:
+                raise ValueError(f"scene {number} of scenes: {error}") from None
+        self._simulator = (image_size, physics_hz, render_stride)
+        self._start_simulator()
+        self._film: list[NDArray[np.uint8]] = []  # for `render`
         self._start: tuple[Setup, Scene, Joints] | None = None  # what was built
         self._actions: list[NDArray[np.float32]] = []  # since the reset
         self._goal_rgb = np.zeros((image_size, image_size, 3), np.uint8)
@@ -183,25 +220,25 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Build a new scene; see the class for `options`. A seed is a scene, bit for bit.
 
         Raises:
-            ValueError: for options that are not allowed, before anything changes.
+            ValueError: for options or a seed that are not allowed, before anything changes.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
         """
-        x, y, _ = self.setup.arm.home
-        request = replace(
-            self.task.request(self.n_pairs),
-            spawn=self.setup.spawn,
-            edge=self.setup.edge,
-            avoid=(x, y) if self.task.stacks else None,
-        )
-        checked = read_options(options, self.task, request, self.setup)
+        number, seed = self._next_scene, None if seed is None else read_seed(seed)
+        if self._scenes is not None:
+            number = number if seed is None else seed % len(self._scenes)
+            seed, wished = self._scenes[number]
+            options = override(wished, options, self.task)
+        checked = self._read(options)
+        self.world.check_open()
         super().reset(seed=seed)
+        if self._scenes is not None:
+            self._scene_number, self._next_scene = number, (number + 1) % len(self._scenes)
         setup, self._drawn, scene, joints = checked.draw(self.np_random)
         self._goal_rgb = np.zeros_like(self._goal_rgb)
         if scene.picture is not None:
             self._build(setup, replace(scene, objects=scene.picture), setup.arm.home_joints)
             self._goal_rgb = self.world.render().rgb
-        self._build(setup, scene, joints)
-        self._recorder.restart()
-        self._recorder.capture()
+        self._show(setup, scene, joints)
         return self._observe(), self._info()
 
     def step(
@@ -212,6 +249,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: for an action that is not in the action space.
             gymnasium.error.ResetNeeded: before the first reset.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         before = self._fulfilled()
         values = check_action(self._box, action)
@@ -222,23 +260,32 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             for motion in pick_and_place(self.robot, (x, y), (place_x, place_y), *turn):
                 self._move(motion)
                 # Rendering changes nothing in the world, so unwanted frames are not drawn.
-                if self.record_frames or self.render_mode == "human":
-                    self._recorder.capture()
+                if self.record_frames or self.render_mode in ("rgb_array_list", "human"):
+                    self._capture()
         else:
             self._move(values)
         if not self._recorder.images:
-            self._recorder.capture()
+            self._capture()
         after = self._fulfilled()
         reward = (sum(after) - sum(before)) / len(after)
         terminated = self.task.succeeded(self.world, self.robot, self.scene) and self.robot.is_home
         return self._observe(), reward, terminated, len(self._actions) >= self.max_steps, self._info()
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """The newest camera frame (H, W, 3) with "rgb_array"; the window shows itself with "human"."""
+    def render(self) -> NDArray[np.uint8] | list[NDArray[np.uint8]] | None:  # type: ignore[override]
+        """What ``render_mode`` says: a frame (H, W, 3), a list of those, or None; a window shows itself.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='rgb_array')")
             return None
-        return self._recorder.images[-1].rgb.copy() if self.render_mode == "rgb_array" else None
+        if not self._recorder.images:
+            raise gym.error.ResetNeeded("call reset() first")
+        if self.render_mode == "rgb_array_list":
+            film, self._film = self._film, []
+            return film
+        return self._picture() if self.render_mode == "rgb_array" else None
 
     def copy(self) -> TabletopEnv:
         """The same scene in the same state in a simulator of its own, to try things; its pictures are tiny."""
@@ -265,13 +312,63 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         scene, actions = original.scene, original._actions
         assert original._start is not None
         setup, _, joints = original._start
-        self._build(setup, scene, joints)
+        self._show(setup, scene, joints)
         for action in actions:
             self.step(action)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.world.check_open()
+        own = ("world", "robot", "_recorder")
+        return deepcopy({name: value for name, value in vars(self).items() if name not in own})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.render_mode == "human":
+            self.render_mode = None  # PyBullet has one window only
+        self._start_simulator()
+        if self._start is not None:
+            self.follow(self)
+            self._film = state["_film"]
 
     def close(self) -> None:
         """Give PyBullet's memory back. Safe to call twice."""
         self.world.close()
+
+    def _start_simulator(self) -> None:
+        image_size, physics_hz, render_stride = self._simulator
+        self.world = Tabletop(self.setup, image_size, physics_hz, gui=self.render_mode == "human")
+        self.robot = Robot(self.world, render_stride)
+        self._recorder = Recorder(self.robot)
+
+    def _read(self, options: Any) -> ResetOptions:
+        """What `reset` is asked for, over what the constructor was."""
+        x, y, _ = self.setup.arm.home
+        request = replace(
+            self.task.request(self.n_pairs),
+            spawn=self.setup.spawn,
+            edge=self.setup.edge,
+            avoid=(x, y) if self.task.stacks else None,
+        )
+        return read_options(override(self._wishes, options, self.task), self.task, request, self.setup)
+
+    def _show(self, setup: Setup, scene: Scene, joints: Joints) -> None:
+        """Start anew with ``scene``, and take its first frame."""
+        self._build(setup, scene, joints)
+        self._film = []
+        self._recorder.restart()
+        self._capture()
+
+    def _capture(self) -> None:
+        """Take a frame of this moment."""
+        self._recorder.capture()
+        if self.render_mode == "rgb_array_list":
+            self._film.append(self._picture())
+
+    def _picture(self) -> NDArray[np.uint8]:
+        """This moment as `render` shows it."""
+        if self.render_size == self.world.image_size:
+            return self._recorder.images[-1].rgb.copy()
+        return self.world.render(self.render_size).rgb
 
     def _build(self, setup: Setup, scene: Scene, joints: Joints) -> None:
         """Start anew with ``scene``, settled, and the arm at ``joints``."""
@@ -327,4 +424,6 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             position, orientation = map(np.array, world.pose(index))
             named = {"id": index, "label": FIRST_OBJECT + index, "kind": item.kind, "color": item.color}
             info["objects"].append(named | {"position": position, "orientation": orientation})
+        if self._scenes is not None:
+            info["scene_number"] = self._scene_number
         return info | (self._recorder.info() if self.record_frames else {})

@@ -156,12 +156,32 @@ def load_weights(model: nn.Module, path: Path) -> None:
 
 
 def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) -> None:
-    """Write `config.json` and `model.safetensors` into `folder`, which is made if it is not there."""
+    """Write `config.json` and `model.safetensors` into `folder`, which is made if it is not there.
+
+    An old checkpoint there stays as it is until the new files are whole.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
-    save_file(tensors, folder / WEIGHTS_FILE, metadata={"format": "pt"})
+    new = folder / f"{WEIGHTS_FILE}.new"
+    try:
+        save_file(tensors, new, metadata={"format": "pt"})
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+    new.replace(folder / WEIGHTS_FILE)
     write_config(folder, config)
+
+
+def swap_in(new: Path, folder: Path) -> None:
+    """Move the files of a checkpoint over those in `folder`, `config.json` last; a card that is there stays."""
+    paths = sorted((p for p in new.rglob("*") if p.is_file()), key=lambda p: p.name == CONFIG_FILE)
+    for path in paths:
+        place = folder / path.relative_to(new)
+        if path.name == "README.md" and place.exists():
+            continue
+        place.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(place)
 
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:

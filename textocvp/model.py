@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from textocvp.checkpoint import (
     load_weights,
     read_config,
     resolve_checkpoint,
+    swap_in,
     write_checkpoint,
 )
 from textocvp.config import ModelConfig
@@ -68,6 +70,17 @@ class TextOCVP(
     def device(self) -> torch.device:
         """Where the model's parameters are."""
         return next(self.parameters()).device
+
+    def save_pretrained(self, save_directory: str | Path, **options: Any) -> str | None:
+        """Write the checkpoint into a folder; an old one stays whole until the new one is. Options: as the hub's."""
+        folder = Path(save_directory)
+        folder.mkdir(parents=True, exist_ok=True)
+        options.setdefault("repo_id", folder.name)
+        # The hub's own removes an old config.json before it writes anything.
+        with TemporaryDirectory(dir=folder, prefix=".new-") as new:
+            result: str | None = super().save_pretrained(new, **options)
+            swap_in(Path(new), folder)
+        return result
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Called by `save_pretrained(folder)`, which also writes a model card unless the folder has one."""

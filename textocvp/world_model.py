@@ -218,7 +218,7 @@ class WorldModel:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
         model = self.model
-        generator = torch.Generator(device=model.device).manual_seed(seed)
+        generator = torch.Generator(device=model.device).manual_seed(int(seed))
         own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
         parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generator)
         slots_BTKD = parsed.slots_BTKD.float()

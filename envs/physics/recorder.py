@@ -42,10 +42,13 @@ class Recorder:
         self.states.append({name: value.astype(np.float32) for name, value in state.items()})
 
     def info(self) -> dict[str, Any]:
-        """`frames` (T, H, W, 3), `frame_segmentations` (T, H, W), and `frame_states` with values (T, ...)."""
+        """Lists over the T frames: `frames` (H, W, 3), `frame_segmentations` (H, W), and `frame_states` by name.
+
+        No arrays (T, ...): T differs from step to step, and vectorised environments join arrays of one shape only.
+        """
         names = self.states[0]
         return {
-            "frames": np.stack([image.rgb for image in self.images]),
-            "frame_segmentations": np.stack([image.segmentation for image in self.images]),
-            "frame_states": {name: np.stack([state[name] for state in self.states]) for name in names},
+            "frames": [image.rgb.copy() for image in self.images],
+            "frame_segmentations": [image.segmentation.copy() for image in self.images],
+            "frame_states": {name: [state[name].copy() for state in self.states] for name in names},
         }

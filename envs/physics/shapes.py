@@ -80,9 +80,14 @@ def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
     return [*outside, *reversed(inside), (0.0, sizes.bowl_floor)]
 
 
-@lru_cache(maxsize=16)
 def bowl_contact_file(sizes: Sizes) -> str:
     """Path of an OBJ file with one convex group for the bowl's floor and for each segment of its wall."""
+    # Only the text is kept: a temporary folder may be swept while the program runs.
+    return generated_file("bowl", ".obj", _bowl_parts(sizes))
+
+
+@lru_cache(maxsize=16)
+def _bowl_parts(sizes: Sizes) -> str:
     # A file, because ``createCollisionShapeArray`` silently stops at 16 shapes and a vertex array cannot hold
     # several parts; PyBullet turns each group of an OBJ file into one convex hull.
     lines: list[str] = []
@@ -113,13 +118,13 @@ def bowl_contact_file(sizes: Sizes) -> str:
             + ring(sizes.bowl_radius, sizes.bowl_height, k, k + 2)
             + ring(sizes.bowl_inner_radius, sizes.bowl_height, k, k + 2),
         )
-    return generated_file("bowl", ".obj", "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
 
 
 def generated_file(stem: str, suffix: str, text: str) -> str:
     """Path of a file with ``text`` in the user's temporary folder; its name carries the content's hash."""
     folder = Path(tempfile.gettempdir()) / f"textocvp-envs-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}{suffix}"
     if not path.exists() or path.read_text() != text:
         # Renamed when whole, so that processes that start together never read half a file.

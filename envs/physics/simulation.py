@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import Any
+from functools import cache, lru_cache, partial
+from typing import Any, NoReturn
 
 import numpy as np
 import pybullet as p
 from gymnasium import logger
+from gymnasium.error import ClosedEnvironmentError
 from numpy.typing import NDArray
 
 from envs.colors import RGB
@@ -30,6 +33,8 @@ LABELS = {"background": 0, "robot": 1}
 
 FIRST_OBJECT = 2  # object i has the label FIRST_OBJECT + i
 
+DISPLAY_SECONDS = 20  # for a window to open, which takes 1 or 2
+
 
 @dataclass(frozen=True)
 class Image:
@@ -42,11 +47,13 @@ class Image:
 
 @dataclass
 class Bullet:
-    """PyBullet's functions, bound to one of its clients."""
+    """PyBullet's functions, bound to one of its clients; ClosedEnvironmentError when it is gone."""
 
     client: int
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
+        if self.client < 0:
+            raise ClosedEnvironmentError("the environment was closed; make a new one")
         return partial(getattr(p, name), physicsClientId=self.client)
 
 
@@ -60,15 +67,23 @@ class Tabletop:
         self.image_size, self.physics_hz = image_size, physics_hz
         self._use(setup)
         self.bullet = _connect(gui)
+        # A world that is dropped without `close` would stay in PyBullet: 28 MB each.
+        self._disconnect = weakref.finalize(self, _disconnect, self.bullet.client)
         self.table = self.arm = -1
         self.objects: list[int] = []
         self.steps = 0
 
     def close(self) -> None:
         """Disconnect. Safe to call twice."""
-        if self.bullet.isConnected():
-            self.bullet.disconnect()
+        self._disconnect()  # does nothing the second time
         self.bullet.client = -1  # PyBullet gives numbers away again
+
+    def check_open(self) -> None:
+        """Raise ClosedEnvironmentError after `close`."""
+        self.bullet.isConnected()
+
+    def __getstate__(self) -> NoReturn:
+        raise TypeError("a simulator cannot be copied; copy the environment, which builds its own")
 
     @property
     def sizes(self) -> Sizes:
@@ -79,8 +94,12 @@ class Tabletop:
         self.setup = setup
         self.camera = Camera(setup.camera, self.image_size, setup.oversampling)
         self._view, self._projection = self.camera.view_matrix, self.camera.projection_matrix
-        drawn = Camera(setup.camera, self.image_size * setup.oversampling)
-        self._background = _empty_table(drawn, setup.table, setup.table_rgb, setup.floor_rgb)
+        self._background = self._empty(self.image_size)
+
+    def _empty(self, image_size: int) -> Image:
+        setup = self.setup
+        drawn = Camera(setup.camera, image_size * setup.oversampling)
+        return _empty_table(drawn, setup.table, setup.table_rgb, setup.floor_rgb)
 
     def build(self, setup: Setup, scene: Scene, joints: Joints) -> None:
         """Throw everything away and build ``scene`` with the arm at ``joints`` (radians)."""
@@ -134,10 +153,11 @@ class Tabletop:
         linear, angular = self.bullet.getBaseVelocity(self.objects[index])
         return max(map(abs, linear)) + self.sizes.block * max(map(abs, angular))
 
-    def render(self) -> Image:
-        """What the camera sees now."""
+    def render(self, image_size: int | None = None) -> Image:
+        """What the camera sees now, in pictures of ``image_size`` pixels or the usual ones."""
         light, many = self.setup.light, self.setup.oversampling
-        size = self.image_size * many
+        size = (image_size or self.image_size) * many
+        background = self._background if image_size is None else self._empty(image_size)
         _, _, rgba, depth, bodies = self.bullet.getCameraImage(
             size,
             size,
@@ -154,13 +174,13 @@ class Tabletop:
         depth = np.asarray(depth, dtype=np.float32).reshape(size, size)
         # Four channels as one number: ten times as fast as a choice by channels.
         drawn = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4).view(np.uint32)[..., 0]
-        drawn = np.where(bodies == -1, self._background.rgb.view(np.uint32)[..., 0], drawn)
+        drawn = np.where(bodies == -1, background.rgb.view(np.uint32)[..., 0], drawn)
         colors = drawn.view(np.uint8).reshape(size, size, 4)
         rows = np.array([colors[i::many] for i in range(many)]).sum(axis=0, dtype=np.uint16)
         total = np.array([rows[:, i::many, :3] for i in range(many)]).sum(axis=0, dtype=np.uint16)
         center = np.s_[(many - 1) // 2 :: many, many // 2 :: many]
         bodies, depth = bodies[center], depth[center]
-        metres = np.where(bodies == -1, self._background.depth[center], self.camera.depth_in_metres(depth))
+        metres = np.where(bodies == -1, background.depth[center], self.camera.depth_in_metres(depth))
         rgb = ((total + many * many // 2) // (many * many)).astype(np.uint8)
         return Image(rgb, self._label[bodies + 1], metres)
 
@@ -236,11 +256,31 @@ def _empty_table(camera: Camera, table: Box2, table_rgb: RGB, floor_rgb: RGB) ->
 
 def _connect(gui: bool) -> Bullet:
     # PyBullet ends the whole process when it finds no display, so look before asking.
-    if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        logger.warn("render_mode='human' needs a display and DISPLAY is not set: running without a window")
-        gui = False
+    if gui and sys.platform.startswith("linux"):
+        display = os.environ.get("DISPLAY")
+        if not display or not _opens_windows(display):
+            state = f"{display!r} shows no window" if display else "is not set"
+            logger.warn(f"render_mode='human' needs a display and DISPLAY {state}: running without a window")
+            gui = False
     client = p.connect(p.GUI if gui else p.DIRECT)
     if client < 0:
         hint = " its window; use render_mode='rgb_array'" if gui else ""
         raise RuntimeError(f"PyBullet could not start{hint}")
     return Bullet(client)
+
+
+@cache
+def _opens_windows(display: str) -> bool:
+    """Whether PyBullet can open a window there, tried in a process that it may end."""
+    code = "import pybullet; raise SystemExit(pybullet.connect(pybullet.GUI) < 0)"
+    command, there = [sys.executable, "-c", code], {**os.environ, "DISPLAY": display}
+    try:
+        tried = subprocess.run(command, env=there, capture_output=True, timeout=DISPLAY_SECONDS)
+    except subprocess.TimeoutExpired:
+        return False
+    return tried.returncode == 0
+
+
+def _disconnect(client: int) -> None:
+    if p.isConnected(client):
+        p.disconnect(client)

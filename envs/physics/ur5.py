@@ -44,9 +44,16 @@ def find_package() -> Distribution | None:
         return None
 
 
-@cache
 def ur5_meshes() -> dict[str, str]:
-    """Link of our arm -> OBJ file in that link's frame; empty, with a warning, when the package is missing.
+    """Link of our arm -> OBJ file in that link's frame; empty, with a warning, when the package is missing."""
+    if not all(Path(path).exists() for path in _write_meshes().values()):
+        _write_meshes.cache_clear()  # the temporary folder was swept
+    return _write_meshes()
+
+
+@cache
+def _write_meshes() -> dict[str, str]:
+    """Convert the package's meshes.
 
     PyBullet draws the STL files black, because they carry no normals; these files do.
     """

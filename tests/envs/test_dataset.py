@@ -130,7 +130,7 @@ def test_the_file_says_what_its_labels_words_and_questions_are(whole: Path, env:
 def test_the_page_names_every_field(whole: Path) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     fields = [name for name in contents(whole) if name != "episode"]
-    assert len(fields) == 14 + 10
+    assert len(fields) == 15 + 10
     for name in fields:
         assert f"| `{name.removeprefix('@')}` |" in page, name
 
@@ -195,7 +195,7 @@ def test_sentences_follow_each_other_in_a_scene(sentences: Path) -> None:
 def test_the_page_names_the_fields_of_sentences(sentences: Path) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     fields = [name for name in contents(sentences) if name != "episode"]
-    assert len(fields) == 14 + 3 + 10
+    assert len(fields) == 15 + 3 + 10
     assert all(f"| `{name.removeprefix('@')}` |" in page for name in fields)
 
 

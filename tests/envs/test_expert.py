@@ -72,7 +72,7 @@ def test_an_episode_has_about_25_frames_and_ends_as_it_began(make: Make) -> None
     for seed in range(8):
         _, info = env.reset(seed=seed)
         start, named = info["frames"][0], np.isin(info["segmentation"], 2 + info["target"])
-        assert info["frames"].shape == (1, 64, 64, 3)
+        assert [frame.shape for frame in info["frames"]] == [(64, 64, 3)]
         _, _, info, frames = play(env)
         assert 24 <= 1 + len(frames[0]) <= 26
         # But for the block that left and the bowl that got it, nothing shows that the arm was away.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -140,9 +141,9 @@ def test_a_file_shows_its_scenes_again(
     page = (ROOT / "docs" / "data.md").read_text().split("## Scenes and factors")[1]
     found: dict[str, Any] = {}
     exec(page.split("```python\n")[1].split("```")[0], found)
-    env, info, drawn = found["env"], found["info"], found["factors"]
+    env, info = found["env"], found["info"]
     with h5py.File("data/varied.h5") as file:
-        frame = file["frames"][0]
+        frame, drawn = file["frames"][0], json.loads(file["episode/factors"].asstr()[0])
     assert env.setup.factors == (factors or SCENES["varied"].factors)
     assert np.array_equal(info["frames"][0], frame)
     assert info["factors"] == drawn and len(drawn) == len(FACTORS) - len(SHARES)

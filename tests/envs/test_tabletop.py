@@ -27,10 +27,10 @@ import gymnasium as gym, envs
 env = gym.make("PutBlockInBowl-v0", record_frames=True)
 for seed in map(int, sys.argv[1:]):
     _, info = env.reset(seed=seed, options={"arm_start": "random"})
-    parts = [info["frames"].tobytes()]
+    parts = [b"".join(map(bytes, info["frames"]))]
     for action in envs.Expert(env).actions():
         info = env.step(action)[4]
-        parts += [info["frames"].tobytes(), info["frame_states"]["object_position"].tobytes()]
+        parts += map(bytes, [*info["frames"], *info["frame_states"]["object_position"]])
 digest = hashlib.sha256(b"".join(parts)).hexdigest()
 print("hash", digest)
 """

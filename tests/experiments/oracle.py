@@ -71,7 +71,7 @@ class StudyOracle:
             return parsed
         states = [info["frame_states"] for info in _history]
         position_TN3 = np.concatenate([state["object_position"] for state in states])
-        tip_T3 = np.concatenate([state["gripper"][:, :3] for state in states])
+        tip_T3 = np.concatenate([state["gripper"] for state in states])[:, :3]
         assert len(position_TN3) >= len(video)
         slots = []
         for t in range(len(video)):

@@ -2,9 +2,11 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from torch import nn
 
 import textocvp
 from envs.colors import COLORS
@@ -28,6 +30,7 @@ from experiments.study.run import run
 from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
 from textocvp import WorldModel
+from textocvp.model import TextOCVP
 
 SHIPPED = Path(textocvp.__file__).parent / "checkpoints" / "tabletop-small"
 
@@ -36,8 +39,12 @@ SHIPPED = Path(textocvp.__file__).parent / "checkpoints" / "tabletop-small"
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`base` is there, `layers-1` was trained with other settings, `layers-2` stopped half-way."""
     folder = tmp_path_factory.mktemp("runs")
+    model = TextOCVP.from_pretrained(SHIPPED)  # with the preset's window, and without foresight
+    predictor = replace(model.config.predictor, window=24)
+    model.config, model.outcome = replace(model.config, predictor=predictor, outcome=None), None
+    model.predictor.ages = nn.Parameter(model.predictor.ages[:24])
     for name in ("base", "layers-1"):
-        shutil.copytree(SHIPPED, folder / name / "checkpoint")
+        model.save_pretrained(folder / name / "checkpoint")
         (folder / name / "following.json").write_text("{}")
     for name in ("base", "layers-2"):
         (folder / name / "state").mkdir(parents=True)

@@ -43,11 +43,11 @@ def test_the_files_hold_no_pickle(folder: Path) -> None:
 
 
 SHA256 = {
-    "cliport": "46d7fa83f8b896b6d363e07b37e7191fc0f40dc10618b82b821584c4f7f056d0",
+    "cliport": "80f54754298e836cf9b42d817e7468ca3e2f4dda0b01ba64a80cfeccb11517e5",
     "mage-small": "2b07776f954026e6f0cb92fa9ecf2165e355bf89907f2eb3c5afadc1a4cab8ad",
     "non-oc-small": "055d230cd31d9e0a8cea7bb5df71d21f7d3447667cfabf9ab2e94b24bd1c57ef",
     "ocvp-seq-small": "fbdf969c2da3cbc0d54abec85040dc2ca983c4e9e5de51f7bcb88dcd89d5d3c1",
-    "tabletop-small": "4a509b7a2cb29cf3bac01a28360fe23fa89adf876909cd6c3b8591b4b18a96a4",
+    "tabletop-small": "f7b6965d4daaf4b263eb4efde3ec416c7cc10ec4e04081c22aaa310a0ea0482b",
     "tabletop-small-40": "c661b48b9daa638025ec59c7fb89e1e30e17867b01195002336abe349b5d9961",
 }
 

@@ -74,6 +74,8 @@ class Episode(Truth):
     """The scene's seed in the simulator, if it has one."""
     success: bool | None = None
     """Whether the instruction was carried out, if that was judged."""
+    reset_options: dict[str, Any] | None = None
+    """What the simulator's `reset` was given beside the seed, if it is known."""
 
 
 class Episodes(ABC):
@@ -241,6 +243,7 @@ class EpisodeFile(Episodes):
             instruction=self.instructions[number],
             seed=None if self.seeds is None else int(self.seeds[number]),
             success=None if self.success is None else bool(self.success[number]),
+            reset_options=self._json("options", number) or None,
             **vars(self.truth(number) or Truth()),
         )
 

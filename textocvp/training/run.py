@@ -17,7 +17,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import asdict, dataclass
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -40,7 +40,24 @@ from textocvp.data import open_episodes
 from textocvp.data.episodes import Episodes
 
 STEP_FILE = "step.json"
+SETTINGS_FILE = "settings.json"
 LOG_EVERY = 20  # updates
+# The least that settings of any stage may be; checked before anything is written.
+LEAST = {
+    "episodes": 1,
+    "steps": 0,
+    "batch": 1,
+    "warmup": 0,
+    "learning_rate": 0.0,
+    "clip_norm": 0.0,
+    "seed": 0,
+    "evaluate_every": 1,
+    "evaluate_episodes": 1,
+    "save_minutes": 0.0,
+    "stride": 1,
+    "clip": 1,
+    "workers": 0,
+}
 SYNC_TIMEOUT = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
 
 
@@ -59,9 +76,13 @@ def allowed_settings() -> Iterator[None]:
         raise SettingsError(str(error)) from error
 
 
+class DivergedError(SettingsError):
+    """Training left the numbers: the loss has no finite gradient any more."""
+
+
 @dataclass
-class TrainingSettings:
-    """What every stage of training can be told; each has its own defaults."""
+class RunPaths:
+    """Where a stage of training reads and writes."""
 
     data: Path
     """Training episodes, from `python -m envs.collect --split train`."""
@@ -69,7 +90,12 @@ class TrainingSettings:
     """Held-out episodes, for the figures."""
     out: Path
     """Folder of the run. If it holds an unfinished run, that run goes on."""
-    _: KW_ONLY
+
+
+@dataclass(kw_only=True)
+class TrainingSettings(RunPaths):
+    """What every stage of training can be told; each has its own defaults."""
+
     episodes: int | None = None
     """Train on the first so many episodes of the file only."""
     set: tuple[str, ...] = ()
@@ -96,6 +122,13 @@ class TrainingSettings:
     """Held-out episodes they are measured on; the final figures use all."""
     save_minutes: float = 4.0
     """Minutes between saved states."""
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            value = getattr(self, name, None)
+            if value is not None and not value >= least:
+                option = name.replace("_", "-")
+                raise SettingsError(f"--{option} is {value}: must be at least {least}")
 
 
 @contextmanager
@@ -245,6 +278,8 @@ class Run:
         if accelerator.num_processes > 1:
             self._agreement = torch.distributed.new_group(backend="gloo", timeout=SYNC_TIMEOUT)
         self.first = load_state(accelerator, args.out)
+        if accelerator.is_main_process:
+            _compare_settings(args, resumed=self.first > 0)
 
     @property
     def device(self) -> torch.device:
@@ -300,6 +335,12 @@ class Run:
     def update(self, step: int, metrics: Mapping[str, float] | None = None) -> None:
         """Take the step that the gradients ask for, and log now and then, also `metrics`, equal on all processes."""
         norm = self.accelerator.clip_grad_norm_(self.module.parameters(), self.args.clip_norm)
+        # With fp16 the scaler skips such a step, and tries a smaller scale.
+        if self.args.precision != "fp16" and not bool(torch.isfinite(torch.as_tensor(norm))):
+            raise DivergedError(
+                f"training diverged at step {step + 1}: the gradient is not finite. Nothing was saved since the last "
+                "good state; lower --learning-rate, or raise --warmup, with another --out"
+            )
         self._optimizer.step()
         self._schedule.step()
         self._optimizer.zero_grad()
@@ -334,7 +375,7 @@ class Run:
         save(self.args.out / "checkpoint")
         metrics = measure(None)
         print(f"final: {metrics}")
-        (self.args.out / file).write_text(metrics.to_json())
+        replace_text(self.args.out / file, metrics.to_json())
         return metrics
 
     def total(self, amount: Tensor) -> Tensor:
@@ -348,6 +389,33 @@ class Run:
         said = torch.tensor(answers, dtype=torch.int32)
         torch.distributed.all_reduce(said, torch.distributed.ReduceOp.MAX, group=self._agreement)
         return tuple(bool(answer) for answer in said)
+
+
+# What decides the result of a run; how long, where and how fast it runs may change when it goes on.
+_DECISIVE = ("preset", "set", "episodes", "batch", "learning_rate", "warmup", "clip_norm", "seed")
+
+
+def _compare_settings(args: TrainingSettings, resumed: bool) -> None:
+    """Note the settings of a new run; refuse to go on with one that had others."""
+    path = args.out / SETTINGS_FILE
+    now = json.loads(json.dumps({name: getattr(args, name, None) for name in _DECISIVE}))
+    if not resumed:
+        replace_text(path, json.dumps(now, indent=2) + "\n")
+    elif path.exists():
+        before = json.loads(path.read_text())
+        for name, value in now.items():
+            if before.get(name) != value:
+                raise SettingsError(
+                    f"{args.out} holds a run with {name.replace('_', '-')} {before.get(name)!r}, not {value!r}: "
+                    "give the same settings to go on with it, or another --out"
+                )
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file; an old one stays whole until the new one is."""
+    new = path.with_name(path.name + ".new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
 
 
 @contextmanager

@@ -119,12 +119,12 @@ def test_a_cubes_corners_keep_their_edges_and_a_flat_face_is_one() -> None:
 
 def test_without_its_package_the_arm_is_of_cylinders_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5, "PACKAGE", "no-such-package")
-    ur5.ur5_meshes.cache_clear()
+    ur5._write_meshes.cache_clear()
     with pytest.warns(UserWarning, match=r"no-such-package is not installed.*textocvp\[ur5\]"):
         env = TabletopEnv(scene="cliport", image_size=168)
         _, info = env.reset(seed=0)
     env.close()
-    ur5.ur5_meshes.cache_clear()
+    ur5._write_meshes.cache_clear()
     share = (info["segmentation"] == 1).mean()
     assert 0.04 < share < 0.12  # as large as the real one, which has 7 %
 

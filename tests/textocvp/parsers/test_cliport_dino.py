@@ -257,6 +257,7 @@ def test_encoding_goes_on_where_it_was_killed_and_refuses_what_is_not_its_own(
     train_parser.train(dataclasses.replace(args, steps=2))
     assert parts[1].exists() and parts[0].stat().st_mtime_ns == before
 
+    (args.out / "settings.json").unlink()  # the cache looks for itself
     with pytest.raises(CacheError, match="from other episodes"):
         train_parser.train(dataclasses.replace(args, steps=3, episodes=17))
     wrong = write_tiny_dino(tmp_path / "wrong", seed=1)
