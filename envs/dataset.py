@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
@@ -386,6 +389,30 @@ def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -
     Raises:
         ValueError: when ``out`` exists and is something else, or was collected with another configuration.
     """
+    with _only_collector(out):
+        _collect(config, episodes, out, workers)
+
+
+@contextmanager
+def _only_collector(out: Path) -> Iterator[None]:
+    """Refuse a second collector of the same file, as a job queued twice starts; the lock ends with the process."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    path = out.with_name(f".{out.name}.lock")
+    with open(path, "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.path.samestat(os.fstat(lock.fileno()), path.stat())
+        except (BlockingIOError, FileNotFoundError):
+            mine = False
+        if not mine:  # or it was unlinked by the collector that has just finished
+            raise ValueError(f"{out} is being collected by another process: wait, or choose another --out")
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int) -> None:
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
     step = max(1, EPISODES_PER_PIECE // config.sentences) * config.sentences  # whole scenes
@@ -395,7 +422,7 @@ def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -
     with tqdm(total=episodes, initial=min(done, episodes), unit="episode", desc=config.split) as progress:
         run = Parallel(n_jobs=workers, return_as="generator", pre_dispatch=2 * workers)
         spans = zip(ranges, pieces, strict=True)
-        jobs = (delayed(_collect_piece)(config, *span, piece) for span, piece in spans)
+        jobs = (delayed(_collect_piece)(config, *span, piece, os.getpid()) for span, piece in spans)
         for (start, stop), piece, _ in zip(ranges, pieces, run(jobs), strict=True):
             progress.update(stop - start)
             waiting.append(piece)
@@ -415,7 +442,21 @@ def _environment(config: EpisodeConfig) -> TabletopEnv:
     return config.make()
 
 
-def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path) -> None:
+@cache
+def _end_with(parent: int) -> None:
+    """Let this worker process end soon after its collector has ended, however that did."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    if os.getpid() != parent:
+        threading.Thread(target=watch, daemon=True).start()
+
+
+def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path, collector: int) -> None:
+    _end_with(collector)
     if episode_count(piece, config) == stop - start:
         return
     env = _environment(config)

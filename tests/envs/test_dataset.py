@@ -331,3 +331,15 @@ def test_the_command_line_collects_and_previews(tmp_path: Path) -> None:
     sheet = iio.imread(tmp_path / "sheet.png")
     assert sheet.shape == (2 * 132, 9 * 132, 3)
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
+
+
+def test_two_collectors_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    """The second is refused while the first is at work, and not afterwards."""
+    out, config = tmp_path / "one.h5", EpisodeConfig("train", image_size=16)
+    with dataset._only_collector(out), pytest.raises(ValueError, match="being collected by another process"):
+        collect(config, 1, out)
+    assert not out.exists()
+    collect(config, 1, out)
+    assert dataset.episode_count(out, config) == 1 and [path.name for path in tmp_path.iterdir()] == [
+        "one.h5"
+    ]
