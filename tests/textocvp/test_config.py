@@ -97,3 +97,11 @@ def test_a_value_of_json_that_makes_no_sense_is_refused_by_name(
         ModelConfig.from_dict({**data, part: value})
     with pytest.raises(ValueError, match="name is missing"):
         ModelConfig.from_dict({"stage": "parser"})
+
+
+@pytest.mark.parametrize(
+    ("preset_name", "slots"), [("tabletop-small", 1), ("savi-small", 1), ("cliport", 10**9)]
+)
+def test_slot_counts_without_sense_are_refused_before_anything_is_built(preset_name: str, slots: int) -> None:
+    with pytest.raises(ValueError, match=rf"parser\.num_slots must be .* to 1000, not {slots}"):
+        with_settings(preset(preset_name), [f"parser.num_slots={slots}"])

@@ -18,6 +18,8 @@ from torch import Tensor, nn
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.slots import SlotLayout
 
+MOST_SLOTS = 1000  # more would fill the memory before anything is seen
+
 
 @dataclass(frozen=True)
 class ParserConfig:
@@ -37,6 +39,11 @@ class ParserConfig:
         if self.layout.explicit != explicit:
             wanted = str(explicit).lower()
             raise ValueError(f"parser.kind {self.kind!r} needs parser.layout.explicit = {wanted}")
+
+    def _check_slots(self, least: int, what: str) -> None:
+        if not least <= self.num_slots <= MOST_SLOTS:
+            allowed = f"{least} ({what}) to {MOST_SLOTS}"
+            raise ValueError(f"parser.num_slots must be {allowed}, not {self.num_slots}")
 
     @staticmethod
     def _check_heads(width: int, heads: int) -> None:

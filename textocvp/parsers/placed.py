@@ -47,6 +47,7 @@ class PlacedConfig(CropConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check_slots(2, "a background and a thing")
         self._check_heads(2 * self.layout.content, self.transition_heads)
 
 

@@ -45,6 +45,7 @@ class SaviConfig(ParserConfig):
 
     def __post_init__(self) -> None:
         self._check_layout(explicit=False)
+        self._check_slots(2 if self.initializer == "cluster" else 1, "with clusters 2, for the background")
         self._check_heads(self.layout.dim, self.transition_heads)
         _ = self.features  # patches must divide the frame
 

@@ -70,10 +70,7 @@ class VotesConfig(CropConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_slots < 3:
-            raise ValueError(
-                f"num_slots must be at least 3 (background, robot, an object), not {self.num_slots}"
-            )
+        self._check_slots(3, "background, robot and a thing")
 
 
 class Residual(nn.Module):
