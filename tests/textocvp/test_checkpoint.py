@@ -209,3 +209,20 @@ def test_half_precision_weights_are_accepted(folder: Path) -> None:
     save_file({name: t.half() if t.is_floating_point() else t for name, t in load_file(path).items()}, path)
     model = TextOCVP.from_pretrained(folder)
     assert all(p.dtype == torch.float32 for p in model.parameters())
+
+
+def test_an_old_checkpoint_stays_whole_where_the_new_one_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk; nothing half-written is left beside it."""
+    model = TextOCVP(PRESETS["tabletop-small"])
+    model.save_pretrained(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(*args: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("textocvp.checkpoint.save_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        model.save_pretrained(tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -391,14 +391,18 @@ class Run:
         return tuple(bool(answer) for answer in said)
 
 
-# What decides the result of a run; how long, where and how fast it runs may change when it goes on.
-_DECISIVE = ("preset", "set", "episodes", "batch", "learning_rate", "warmup", "clip_norm", "seed")
+# What may change when a run goes on: where it lies, how long, how fast and how closely watched it is.
+_FREE = {
+    "out", "data", "val", "parser", "vqvae", "taught", "steps", "accumulate", "precision", "workers", "save_minutes",
+    "evaluate_every", "evaluate_episodes",
+}  # fmt: skip
 
 
 def _compare_settings(args: TrainingSettings, resumed: bool) -> None:
     """Note the settings of a new run; refuse to go on with one that had others."""
     path = args.out / SETTINGS_FILE
-    now = json.loads(json.dumps({name: getattr(args, name, None) for name in _DECISIVE}))
+    now = {name: value for name, value in asdict(args).items() if name not in _FREE}
+    now = json.loads(json.dumps(now, default=str))
     if not resumed:
         replace_text(path, json.dumps(now, indent=2) + "\n")
     elif path.exists():

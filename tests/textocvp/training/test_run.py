@@ -19,8 +19,9 @@ from tests.textocvp.training.runs import losses, parser_run, predictor_run, same
 from textocvp import cli
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.prefetch import prefetch
+from textocvp.training import predictor
 from textocvp.training.clips import ClipReader
-from textocvp.training.run import Run, SettingsError
+from textocvp.training.run import DivergedError, Run, SettingsError
 
 
 def drawing_run(folder: Path, out: str, **changes):
@@ -162,3 +163,45 @@ def test_what_cannot_be_done_is_said(folder: Path, monkeypatch: pytest.MonkeyPat
     arguments = ["train", "parser", *files, "--out", str(folder / "half"), "--precision", "fp16"]
     assert cli.main(arguments) == 1
     assert "fp16 needs a GPU" in capsys.readouterr().err and not (folder / "half").exists()
+
+
+def test_a_run_with_other_settings_is_not_taken_for_the_same(folder: Path) -> None:
+    """The first difference is named; more steps are no difference."""
+    run = predictor_run(folder, "settings", steps=2)
+    train(run)
+    before = weights(run.out)
+    with pytest.raises(
+        SettingsError, match=r"holds a run with moving 20\.0, not 5\.0: give the same settings"
+    ):
+        train(replace(run, steps=3, moving=5.0))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in weights(run.out).items())
+    train(replace(run, steps=3))
+    assert len(losses(run.out)) == 3
+
+
+@pytest.mark.parametrize(
+    ("setting", "least"), [("steps", 0), ("batch", 1), ("seed", 0), ("evaluate_every", 1), ("episodes", 1)]
+)
+def test_settings_without_sense_are_refused_before_anything_is_written(folder: Path, setting, least) -> None:
+    option = setting.replace("_", "-")
+    with pytest.raises(SettingsError, match=f"--{option} is {least - 1}: must be at least {least}"):
+        predictor_run(folder, "senseless", **{setting: least - 1})
+    assert not (folder / "senseless").exists()
+
+
+def test_a_run_that_diverges_ends_and_keeps_its_last_good_state(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = predictor_run(folder, "diverging", steps=2)
+    train(run)
+    before = {path: path.read_bytes() for path in (run.out / "checkpoint").iterdir()}
+    loss = predictor.slot_loss
+
+    def poisoned(*args):
+        terms = loss(*args)
+        return replace(terms, position=terms.position * float("nan"))
+
+    monkeypatch.setattr(predictor, "slot_loss", poisoned)
+    with pytest.raises(DivergedError, match="diverged at step 3: the gradient is not finite"):
+        train(replace(run, steps=4))
+    assert all(path.read_bytes() == content for path, content in before.items())
