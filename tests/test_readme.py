@@ -95,7 +95,7 @@ def test_every_snippet_runs(clone: Path, monkeypatch: pytest.MonkeyPatch) -> Non
             exec(compile(snippet.run, "README.md", "exec"), names)
         elif snippet.ci is None:
             shell(snippet.run, clone)
-    for film in ("imagined.gif", "beside.gif", "what-if.gif"):
+    for film in ("imagined.gif", "what-if.gif"):
         assert len(list(iio.imiter(clone / film))) == 25
     assert names["what_if"].slots.shape[0] == 3 and names["then"].texts[0].endswith("yellow bowl")
     assert (clone / "strip.png").stat().st_size > 1000

@@ -218,9 +218,10 @@ class WorldModel:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
         model = self.model
-        generator = torch.Generator(device=model.device).manual_seed(int(seed))
+        # One for each scene: where it stands in a batch must not matter.
+        generators = [torch.Generator(device=model.device).manual_seed(int(seed)) for _ in frames_BT3HW]
         own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
-        parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generator)
+        parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generators)
         slots_BTKD = parsed.slots_BTKD.float()
         seen = model.renderer.remember(frames_BT3HW[:, 0], parsed.attention_BTKHW[:, 0], slots_BTKD[:, 0])
         size = self.image_size if seen is None else (frames_BT3HW.shape[-2], frames_BT3HW.shape[-1])

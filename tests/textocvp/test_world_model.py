@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import torch
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from textocvp import Rollout, WorldModel
 from textocvp.checkpoint import CheckpointError
+from textocvp.model import TextOCVP
+from textocvp.presets import PRESETS
 from textocvp.world_model import bundled_checkpoints
 
 TEXT = "put the red block in the blue bowl"
@@ -236,3 +239,13 @@ def test_the_bundled_checkpoint_loads_and_imagines() -> None:
     H, W = world_model.image_size
     rollout = world_model.rollout(np.full((H, W, 3), 60, np.uint8), TEXT, horizon=2)
     assert isinstance(rollout, Rollout) and rollout.frames.shape == (1, 3, 3, H, W)
+
+
+def test_a_scene_is_imagined_alike_wherever_it_stands_in_a_batch() -> None:
+    """Slots that are drawn at random included."""
+    config = PRESETS["savi-small"]
+    model = WorldModel(TextOCVP(replace(config, parser=replace(config.parser, initializer="gaussian"))))
+    scenes = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    together = model.rollout(scenes, TEXT, horizon=2, seed=3)
+    alone = model.rollout(scenes[2], TEXT, horizon=2, seed=3)
+    torch.testing.assert_close(together.slots[2], alone.slots[0], atol=1e-4, rtol=1e-4)
