@@ -285,7 +285,7 @@ def imagine(
     horizon = min(HORIZON, model.longest_horizon or HORIZON)
     rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
     assert rollout.attention is not None  # `check_model` saw to it
-    pairs = zip(rollout.attention.double().cpu().numpy(), texts, strict=True)
+    pairs = zip(rollout.attention.cpu().double().numpy(), texts, strict=True)
     return [merge_tokens(attention, model.words(text), text) for attention, text in pairs], rollout
 
 

@@ -93,7 +93,7 @@ def slot_center(rollout: Rollout, slots: Sequence[int], frame: int) -> NDArray[n
 
     The position of its slot; of several slots their mean, weighted by the pixels that each of them wins.
     """
-    positions_k2 = rollout.positions[0, frame, list(slots)].double().cpu().numpy()
+    positions_k2 = rollout.positions[0, frame, list(slots)].cpu().double().numpy()
     if len(slots) == 1:
         return positions_k2[0]
     area_k = frame_masks(rollout, frame)[0, list(slots)].sum((1, 2))
