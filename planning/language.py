@@ -7,6 +7,7 @@ The grammar of the data's captions (paper, section 4.1); `RELATIONS` has what ma
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,12 +117,25 @@ class PictureGoal:
 AnyGoal = Goal | PictureGoal
 
 
+_NEGATIONS = re.compile(r"\b(not|never|no|without|don't)\b")
+_BETWEEN = re.compile(r"\s*(?:,|;|\.|\b(?:and|then)\b)+\s*")  # between two instructions
+
+
 def _parse(text: str) -> tuple[Instruction, ...]:
-    """Whatever a sentence asks for, in its order."""
+    """Whatever a sentence asks for, in its order; a ValueError if a part of it cannot be read, or it is a negation."""
+    forms = ", ".join(f"'put {relation.template}'" for relation in RELATIONS.values())
+    if not isinstance(text, str):
+        raise TypeError(f"a goal is a sentence, not {type(text).__name__}; its form is {forms}")
+    if _NEGATIONS.search(text.lower()):
+        raise ValueError(f"{text!r} says what shall not be; a goal says what shall be, in the form {forms}")
     found = []
-    for name, relation in RELATIONS.items():
-        kind, target_kind = relation.kinds
-        for match in relation.pattern.finditer(text.lower()):
-            thing, target = Thing(match["thing"], kind), Thing(match["target"], target_kind)
-            found.append((match.start(), Instruction(name, thing, target)))
-    return tuple(instruction for _, instruction in sorted(found))
+    for part in filter(None, _BETWEEN.split(text.lower())):
+        for name, relation in RELATIONS.items():
+            if match := relation.pattern.search(part):
+                kind, target_kind = relation.kinds
+                things = Thing(match["thing"], kind), Thing(match["target"], target_kind)
+                found.append(Instruction(name, *things))
+                break
+        else:
+            raise ValueError(f"cannot read {part!r} in {text!r}; the form is {forms}")
+    return tuple(found)

@@ -12,7 +12,7 @@ def test_instruction_text_round_trip() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "push the red block", "put the red block in the blue bowl and the green block in the gray bowl"],
+    ["", "put the red block in the blue bowl and the green block in the gray bowl"],
 )
 def test_instruction_wants_exactly_one_pair(text: str) -> None:
     with pytest.raises(ValueError, match="expected one"):
@@ -32,6 +32,28 @@ def test_goal_of_the_environments_grammar() -> None:
 
 def test_goal_is_checked() -> None:
     with pytest.raises(ValueError, match="at least one instruction"):
-        Goal.parse("hello")
+        Goal.parse("")
     with pytest.raises(ValueError, match="each thing once"):
         Goal((put_in("red", "blue"), put_in("red", "gray")))
+
+
+@pytest.mark.parametrize("read", [Goal.parse, Instruction.parse])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("do not put the red block in the blue bowl", "says what shall not be"),
+        ("place the red block into the blue bowl", "cannot read 'place the red block into the blue bowl'"),
+        (
+            "put the red block in the blue bowl and the green block into the gray bowl",
+            "cannot read 'the green block into the gray bowl' in 'put the red",
+        ),
+    ],
+)
+def test_what_cannot_be_read_is_named_and_never_left_out(read, text: str, says: str) -> None:
+    with pytest.raises(ValueError, match=f"{says}.*form 'put the|{says}.*form is 'put the"):
+        read(text)
+
+
+def test_then_and_commas_stand_between_instructions_too() -> None:
+    goal = Goal.parse("Put the red block in the blue bowl, then put the green block in the gray bowl.")
+    assert goal.instructions == (put_in("red", "blue"), put_in("green", "gray"))
