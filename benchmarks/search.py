@@ -8,7 +8,6 @@ in scenes of `RearrangeBlocks-v0` that need three sentences. About 5 minutes on 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 
 import gymnasium as gym
 import numpy as np
@@ -17,20 +16,12 @@ import tyro
 
 import envs  # noqa: F401 - registers the environments
 from envs.splits import SPLITS
-from planning import (
-    DEFAULT_CRITERION,
-    DEFAULT_SCORE,
-    AppearanceGrounder,
-    BeamPlanner,
-    Goal,
-    SearchPlanner,
-    measure_rollout,
-    watched_frames,
-)
+from experiments.runtime import CANDIDATES, planning_work
+from experiments.study.scenes import SampledScene, sample_scene, study_scenes
+from experiments.study.timing import Work, race
+from planning import AppearanceGrounder, BeamPlanner, Goal, SearchPlanner
 from planning.search import Wanted, places
 from textocvp import WorldModel
-
-SENTENCES, FRAMES, STRIDE = 30, 24, 3
 
 
 @dataclass(frozen=True)
@@ -47,52 +38,56 @@ class Args:
     """Of torch."""
 
 
+def foresight(model: WorldModel, sampled: SampledScene) -> Work:
+    """What `planning_work` does in a query, with outcomes instead of films."""
+    image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
+    goal = Goal.parse(sampled.texts[0])
+    said = ground(model.parse(image_1HW3)).with_kinds(goal.things).instructions("in")
+    texts = [said[i % len(said)].text for i in range(CANDIDATES)]
+
+    def query() -> object:
+        parsed = model.parse(image_1HW3)
+        grounding = ground(parsed).with_kinds(goal.things)
+        things = sorted(grounding.things)
+        return Wanted.of_relations(goal, things).ratios(
+            places(model.outcome(parsed, texts), grounding, things)
+        )
+
+    return query
+
+
 def main(args: Args) -> None:
     """Run and print."""
     torch.set_num_threads(args.threads)
     model, val = WorldModel.from_pretrained(args.checkpoint), SPLITS["val"]
-    env = gym.make("PutBlockInBowl-v0", control="primitive")
+    env = (scenes := study_scenes("val", args.scenes, seed=0))[0].make()
     same, films, outcomes = 0, [], []
-    for number in range(args.scenes):
-        seed = val.seed(number)
-        observation, info = env.reset(seed=seed, options=val.options(seed))
-        ground, goal = AppearanceGrounder.from_info(info), Goal.parse(info["instruction"])
-        film = BeamPlanner(model, depth=1, candidates="scene")
-        chosen = film.plan(observation["rgb"], goal, ground).instruction
-        same += SearchPlanner(model, depth=1).plan(observation["rgb"], goal, ground).instruction == chosen
-        if number >= args.repeats:
-            continue
-        (one,) = goal.instructions
-        frames = watched_frames(FRAMES + 1, DEFAULT_CRITERION.thresholds.settle_frames, STRIDE)
-        said = ground(model.parse(observation["rgb"][None])).instructions("in")
-        texts = [said[i % len(said)].text for i in range(SENTENCES)]
-        began = perf_counter()
-        parsed = model.parse(observation["rgb"][None])
-        grounding = ground(parsed).with_kinds(goal.things)
-        trace = measure_rollout(model.rollout(parsed, texts, horizon=FRAMES), grounding, one, frames=frames)
-        DEFAULT_SCORE(trace), DEFAULT_CRITERION(trace)
-        films.append(perf_counter() - began)
-        began = perf_counter()
-        parsed = model.parse(observation["rgb"][None])
-        grounding = ground(parsed).with_kinds(goal.things)
-        things = sorted(grounding.things)
-        Wanted.of_relations(goal, things).ratios(places(model.outcome(parsed, texts), grounding, things))
-        outcomes.append(perf_counter() - began)
+    for number, scene in enumerate(scenes):
+        sampled = sample_scene(env, scene)
+        image, ground = sampled.observation["rgb"], AppearanceGrounder.from_info(sampled.info)
+        goal = Goal.parse(sampled.texts[0])
+        chosen = BeamPlanner(model, depth=1, candidates="scene").plan(image, goal, ground).instruction
+        same += SearchPlanner(model, depth=1).plan(image, goal, ground).instruction == chosen
+        if number < args.repeats:
+            works = {"films": planning_work(model, "query", sampled), "outcomes": foresight(model, sampled)}
+            seconds = race(works, 1, 0.0)
+            films.append(seconds["films"][0])
+            outcomes.append(seconds["outcomes"][0])
     ratios = np.quantile(np.divide(films, outcomes), [0.5, 0.25, 0.75])
     took = f"films {np.median(films):.3f} s, outcomes {np.median(outcomes):.3f} s"
     faster = f"{ratios[0]:.1f} times faster (quartiles {ratios[1]:.1f}, {ratios[2]:.1f})"
-    print(f"{SENTENCES} sentences, median of {len(films)}: {took}; {faster}")
+    print(f"{CANDIDATES} sentences, median of {len(films)}: {took}; {faster}")
     print(f"the same choice in {same} of {args.scenes} scenes ({same / args.scenes:.3f})")
     env = gym.make("RearrangeBlocks-v0", control="primitive")
-    seconds, steps = [], []
+    planned, steps = [], []
     for number in range(args.repeats):
         observation, info = env.reset(seed=val.seed(number), options={"family": "swap", "n_objects": 6})
         goal = Goal.parse(info["instruction"])
         plan = SearchPlanner(model).plan(observation["rgb"], goal, AppearanceGrounder.from_info(info))
-        seconds.append(plan.seconds)
+        planned.append(plan.seconds)
         steps.append(len(plan.best.instructions))
-    print(f"plans over 6 objects, sentences {sorted(steps)}: median {np.median(seconds):.2f} s, longest "
-          f"{max(seconds):.2f} s")  # fmt: skip
+    print(f"plans over 6 objects, sentences {sorted(steps)}: median {np.median(planned):.2f} s, longest "
+          f"{max(planned):.2f} s")  # fmt: skip
 
 
 if __name__ == "__main__":

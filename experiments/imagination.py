@@ -41,6 +41,7 @@ from planning import (
     AnySentencePlanner,
     AppearanceGrounder,
     BelievingPlanner,
+    EpisodeResult,
     Foresees,
     Goal,
     LiteralController,
@@ -151,9 +152,14 @@ class Episode:
         """Of the scene."""
         return str(dict(self.scene.options)["family"])
 
+    @property
+    def searcher(self) -> Searcher:
+        """Who acts."""
+        return {**LINES, **CURVE}[self.method]
+
     def run(self, worker: Worker) -> Played:
         """Play it."""
-        env, searcher = worker.environment(self.scene), {**LINES, **CURVE}[self.method]
+        env, searcher = worker.environment(self.scene), self.searcher
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         if searcher.plan is None:
             said = []
@@ -176,9 +182,11 @@ class Episode:
             result.error,
         )
 
-    def pursue(self, worker: Worker, observation: Mapping[str, Any], info: Mapping[str, Any]) -> Any:
+    def pursue(
+        self, worker: Worker, observation: Mapping[str, Any], info: Mapping[str, Any]
+    ) -> EpisodeResult:
         """Plan and act; see `run_episode`."""
-        searcher = {**LINES, **CURVE}[self.method]
+        searcher = self.searcher
         assert searcher.plan is not None
         goal = goal_of(observation, info)
         return run_episode(

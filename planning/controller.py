@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from planning.camera import PinholeCamera
@@ -71,19 +72,22 @@ class LiteralController:
 
     def _point(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> tuple[float, float]:
         center = slot_center(rollout, grounding.slots_of(thing), 0)
-        x, y, _ = self.camera.unproject_to_plane(center, self._height(rollout, grounding, thing))
+        height = self._height(rollout, grounding, thing, center)
+        x, y, _ = self.camera.unproject_to_plane(center, height)
         return float(x), float(y)
 
-    def _height(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> float:
+    def _height(
+        self, rollout: Rollout, grounding: Grounding, thing: Thing, center: NDArray[np.float64]
+    ) -> float:
         """Metres above the table of the point that a thing's slot is centred on, by what it is seen to stand on."""
-        center = slot_center(rollout, grounding.slots_of(thing), 0)
         for relation in RELATIONS.values():
             if thing.kind != relation.kinds[0]:
                 continue
             for other in grounding.of_kind(relation.kinds[1]):
-                off = center - slot_center(rollout, grounding.slots_of(other), 0) - relation.offset_px
-                if other != thing and np.linalg.norm(off) <= relation.within_px:
-                    below = self._height(rollout, grounding, other)
+                below_it = slot_center(rollout, grounding.slots_of(other), 0)
+                off = relation.distance_of_places(torch.as_tensor(center), torch.as_tensor(below_it))
+                if other != thing and off <= relation.within_px:
+                    below = self._height(rollout, grounding, other, below_it)
                     return below + relation.place_height - RESTING_HEIGHTS[other.kind]
         return RESTING_HEIGHTS[thing.kind]
 

@@ -29,8 +29,11 @@ class Relation:
 
     def distance(self, thing_NHW: Tensor, target_NHW: Tensor) -> Tensor:
         """How far bool masks (..., H, W) are from it: (...) in pixels; inf where a mask is empty."""
-        off_N2 = centroids(thing_NHW) - centroids(target_NHW)
-        return (off_N2 - off_N2.new_tensor(self.offset_px)).norm(dim=-1).nan_to_num(nan=UNSEEN)
+        return self.distance_of_places(centroids(thing_NHW), centroids(target_NHW)).nan_to_num(nan=UNSEEN)
+
+    def distance_of_places(self, thing_N2: Tensor, target_N2: Tensor) -> Tensor:
+        """The same of places (..., 2) in pixels."""
+        return (thing_N2 - target_N2 - thing_N2.new_tensor(self.offset_px)).norm(dim=-1)
 
     @property
     def pattern(self) -> re.Pattern[str]:

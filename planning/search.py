@@ -102,8 +102,8 @@ def seen_supports(places_BN2: Tensor, things: Sequence[Thing]) -> list[dict[Thin
             for m, other in enumerate(things):
                 for relation in RELATIONS.values():
                     if n != m and (thing.kind, other.kind) == relation.kinds:
-                        off_2 = places_N2[n] - places_N2[m] - places_N2.new_tensor(relation.offset_px)
-                        near.append((float(off_2.norm()) / relation.within_px, other))
+                        off = relation.distance_of_places(places_N2[n], places_N2[m])
+                        near.append((float(off) / relation.within_px, other))
             if thing.kind == "block":
                 carried[thing] = min(near, key=lambda one: one[0])[1]
         seen.append(carried)

@@ -186,9 +186,14 @@ def swap_in(new: Path, folder: Path) -> None:
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Write `config.json` into `folder`; an old one stays whole until the new one is."""
-    new = folder / f"{CONFIG_FILE}.new"
-    new.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-    new.replace(folder / CONFIG_FILE)
+    replace_text(folder / CONFIG_FILE, json.dumps(config, indent=2) + "\n")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file; an old one stays whole until the new one is."""
+    new = path.with_name(path.name + ".new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
 
 
 def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:

@@ -143,10 +143,8 @@ def check_parts(config: ModelConfig) -> None:
             if has != wanted:
                 way = f"set renderer.{name}={wanted}"
                 raise ValueError(f"renderer.{name} is {has}, the encoder's features have {wanted}: {way}")
-    for name in ("predictor", "outcome"):
-        if not getattr(
-            getattr(config, name), "color_bias", False
-        ):  # an option of predictors that attend to the text
+    for name, part in (("predictor", config.predictor), ("outcome", config.outcome)):
+        if not getattr(part, "color_bias", False):  # an option of predictors that attend to the text
             continue
         needs = ""
         if not text.words_have_rgb:

@@ -357,21 +357,22 @@ def _write(this: Run, results: Results, found: Found, manifest: str) -> None:
 
 def scenes_manifest(units: Sequence[Unit[Any]]) -> str:
     """Every scene of some units, once, a line each: with it the environments build the same scenes again."""
-    scenes = [
-        scene for unit in units for scene in getattr(unit, "scenes", None) or [getattr(unit, "scene", None)]
-    ]
-    lines = dict.fromkeys(json.dumps(asdict(scene), default=str) for scene in scenes if scene is not None)
+    scenes = chain.from_iterable(map(_scenes_of, units))
+    lines = dict.fromkeys(json.dumps(asdict(scene), default=str) for scene in scenes)
     return "[\n" + ",\n".join(sorted(lines)) + "\n]\n" if lines else ""
 
 
 def _note_seeds(seeds: dict[str, list[int]], part: str, units: Sequence[Unit[Any]]) -> None:
     """The seeds of every unit's `scene` or `scenes`, by what it was used for, and its `slot_seeds`."""
     for unit in units:
-        scenes = getattr(unit, "scenes", None) or filter(None, [getattr(unit, "scene", None)])
         used = [("slots", seed) for seed in getattr(unit, "slot_seeds", ())]
-        for group, seed in used + [(f"{part}, {scene.split}", scene.seed) for scene in scenes]:
+        for group, seed in used + [(f"{part}, {scene.split}", scene.seed) for scene in _scenes_of(unit)]:
             if seed not in (known := seeds.setdefault(group, [])):
                 known.append(seed)
+
+
+def _scenes_of(unit: Unit[Any]) -> list[Any]:
+    return list(getattr(unit, "scenes", None) or filter(None, [getattr(unit, "scene", None)]))
 
 
 class OutputFolder:

@@ -36,6 +36,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
+from textocvp.checkpoint import replace_text
 from textocvp.data import open_episodes
 from textocvp.data.episodes import Episodes
 
@@ -413,13 +414,6 @@ def _compare_settings(args: TrainingSettings, resumed: bool) -> None:
                     f"{args.out} holds a run with {name.replace('_', '-')} {before.get(name)!r}, not {value!r}: "
                     "give the same settings to go on with it, or another --out"
                 )
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file; an old one stays whole until the new one is."""
-    new = path.with_name(path.name + ".new")
-    new.write_text(text, encoding="utf-8")
-    new.replace(path)
 
 
 @contextmanager
