@@ -53,7 +53,7 @@ PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}
 """What each stage of training trains."""
 FIGURES = {"parser": ("quality.json",), "predictor": ("following.json", "slot_errors.json")}
 """What each stage writes last; `slot_errors.json` where the held-out episodes have no masks."""
-WHERE_FROM = ("weights", "fingerprint", "vocabulary", "untrained")
+WHERE_FROM = ("weights", "fingerprint", "vocabulary", "untrained", "rewrites", "forms")
 """Options that come from pretrained weights or from captions, not from a run's settings."""
 
 

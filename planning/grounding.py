@@ -88,7 +88,7 @@ class Grounding:
             for name in relations or RELATIONS
             for thing in self.of_kind(RELATIONS[name].kinds[0])
             for target in self.of_kind(RELATIONS[name].kinds[1])
-            if thing != target
+            if thing.color != target.color
         ]
         return tuple(sorted(every))
 

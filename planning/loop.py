@@ -60,7 +60,7 @@ class EpisodeResult:
 def run_episode(
     env: gymnasium.Env[Any, Any],
     planner: Planner,
-    goal: AnyGoal | None = None,
+    goal: AnyGoal | str | None = None,
     *,
     ground: Callable[[Mapping[str, Any]], Grounder] = AppearanceGrounder.from_info,
     controller: Callable[[PinholeCamera], Controller | LiteralController] = Controller,
@@ -76,7 +76,7 @@ def run_episode(
     result and nowhere else: whoever does not see that the goal is reached goes on, and may undo it.
 
     Args:
-        goal: by default what the environment's instruction says.
+        goal: or its sentence, for `Goal.parse`; by default what the environment's instruction says.
         ground: makes a grounder for each observation, of its `info`. `SegmentationGrounder.from_info` reads the
             simulator's truth instead (the control column `privileged`).
         controller: makes the controller, of the scene's camera.
@@ -95,6 +95,7 @@ def run_episode(
             "the loop acts by pick-and-place: make the environment with control='primitive' and without "
             f"place_yaw, so that an action has 4 numbers; its action space is {env.action_space}"
         )
+    goal = Goal.parse(goal) if isinstance(goal, str) else goal
     observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
     rgb = observation["rgb"]
     goal = Goal.parse(info["instruction"]) if goal is None else goal

@@ -230,6 +230,8 @@ def observe(
     world_model: Imagines, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder, seed: int = 0
 ) -> tuple[Rollout, Grounding]:
     """A picture (H, W, 3), parsed and grounded; the goal's sentence says of what kind its things are."""
+    if isinstance(goal, str):
+        raise TypeError(f"the goal is a string: give Goal.parse({goal!r})")
     parsed = world_model.parse(rgb[None], seed=seed)
     return parsed, grounder(parsed).with_kinds(goal.things)
 

@@ -37,12 +37,12 @@ class Relation:
 
     @property
     def pattern(self) -> re.Pattern[str]:
-        """The template as an expression with the groups `thing` and `target`, both names of colours.
+        """The template as an expression with the groups `thing` and `target`, both names of one or two words.
 
         It also takes CLIPort's own wording, "the red blocks in a blue bowl".
         """
         kinds = zip(("thing", "target"), self.kinds, strict=True)
-        named = {role: rf"(?P<{role}>[a-z]+) {kind}s?" for role, kind in kinds}
+        named = {role: rf"(?P<{role}>[a-z]+(?: [a-z]+)?) {kind}s?" for role, kind in kinds}
         return re.compile(self.template.replace("the ", "(?:the|a) ").format(**named))
 
 

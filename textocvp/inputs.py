@@ -198,14 +198,17 @@ def _upside_down(
 
 
 def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int = 3) -> list[str]:
-    """One sentence or several as a list. A word that the encoder does not know is a `UserWarning` that names it.
+    """One sentence or several as a list.
+
+    A word that the encoder does not know is a `UserWarning` that names it. So is a sentence that is like none that it
+    was trained on, however it is reworded.
 
     Args:
         depth: stack level of the user's line, seen from the caller; the warning shows that line.
 
     Raises:
         TypeError: if one is no string.
-        ValueError: if there is none, or an empty one.
+        ValueError: if there is none, or an empty one, or one that denies something to a model that knows only wishes.
     """
     texts = [text] if isinstance(text, str) else list(text)
     if not texts:
@@ -215,14 +218,28 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
             raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
         if not sentence.strip():
             raise ValueError("an empty text; write what is to be done: 'put the red block in the blue bowl'")
+        if denied := encoder.negations(sentence):
+            raise ValueError(
+                f"{sentence!r} says {denied[0]!r}, which this model has never met: it would imagine what is not to "
+                "be. Write what is to be done instead"
+            )
+        if not encoder.words(sentence):
+            raise ValueError(encoder.nothing_said(sentence))
     unknown = list(dict.fromkeys(word for sentence in texts for word in encoder.unknown_words(sentence)))
+    strange = [(sentence, forms) for sentence in texts if (forms := encoder.forms_but(sentence))]
+    said = []
     if unknown:
         words = ", ".join(map(repr, unknown))
-        warnings.warn(
-            f"the text encoder has never met {words}: the rollout may be as if it were not there",
-            UserWarning,
-            stacklevel=depth + 1,
+        said.append(f"the text encoder has never met {words}: the rollout is as if it were not there")
+    if strange:
+        (sentence, forms), more = strange[0], f" (and {len(strange) - 1} more)" if strange[1:] else ""
+        known = " or ".join(map(repr, forms[:3])) + (" and others" if forms[3:] else "")
+        said.append(
+            f"{sentence!r}{more} is read as {encoder.reads(sentence)!r}, and the model was trained on {known}: what "
+            "is imagined may be something else"
         )
+    if said:
+        warnings.warn(". ".join(said), UserWarning, stacklevel=depth + 1)
     return texts
 
 

@@ -24,10 +24,34 @@ from textocvp.text.words import WordsConfig
 TABLETOP_WORDS = ("put", "the", "block", "in", "bowl", "and", "then", "into", "a", "on", "place", "move", "of", "with",
                   "to")  # fmt: skip
 TABLETOP_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
+# Other wordings of its sentences, for models whose captions have none of them.
+TABLETOP_REWRITES = (
+    "please | kindly | now | just | could you | can you | would you | will you | robot => ",
+    "place | move | set | set down | drop | lay | stack | put down => put",
+    "pick up {thing} and put it {place} => put {thing} {place}",
+    "take {thing} and put it {place} => put {thing} {place}",
+    "into | inside | inside of | within => in",
+    "onto | upon | atop | on top of => on",
+    "in {place} put {thing} => put {thing} in {place}",
+    "on {place} put {thing} => put {thing} on {place}",
+    "a | an => the",
+    "blocks | cube | cubes => block",
+    "bowls | dish | dishes => bowl",
+    "grey => gray",
+    "put => put the",
+    "in => in the",
+    "on => on the",
+    "the the => the",
+)
 
-SMALL_TEXT = WordsConfig(vocabulary=TABLETOP_WORDS)
+SMALL_TEXT = WordsConfig(vocabulary=TABLETOP_WORDS, rewrites=TABLETOP_REWRITES)
 PUBLISHED_TEXT = WordsConfig(
-    kind="transformer", dim=512, heads=8, hidden=1024, vocabulary=TABLETOP_WORDS + TABLETOP_COLORS
+    kind="transformer",
+    dim=512,
+    heads=8,
+    hidden=1024,
+    vocabulary=TABLETOP_WORDS + TABLETOP_COLORS,
+    rewrites=TABLETOP_REWRITES,
 )
 SMALL = TextOCVPConfig(dim=128, layers=3, heads=4, hidden=256, attention="causal", window=24, feed_forwards=1)
 SMALL_SEQ = OCVPSeqConfig(dim=128, layers=2, heads=4, hidden=256, attention="causal", window=24)

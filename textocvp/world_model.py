@@ -214,6 +214,15 @@ class WorldModel:
             raise TypeError(f"a text must be a string, not {type(text).__name__}")
         return self.model.text.words(text)
 
+    def reads(self, text: str) -> str:
+        """What the model understands: a sentence in the wording that it was trained on, without unknown words.
+
+        Raises:
+            TypeError, ValueError: as `rollout`.
+        """
+        (text,) = checked_texts(text, self.model.text)
+        return self.model.text.reads(text)
+
     def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Rollout:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")

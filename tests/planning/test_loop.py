@@ -141,7 +141,7 @@ def test_what_cannot_be_grounded_ends_the_episode_with_a_reason(env: gym.Env[Any
     missing = next(
         color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env))
     )
-    result = run_episode(env, planner, Goal((put_in(missing, missing),)), seed=0)
+    result = run_episode(env, planner, Goal((put_in(missing, "teal"),)), seed=0)
     assert not result.success and result.steps == 0
     assert result.error is not None and f"no {missing} block" in result.error
 

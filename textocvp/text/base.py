@@ -102,6 +102,22 @@ class TextEncoder(nn.Module):
         """The words that this encoder never learned, in order, each once: for a warning that names them."""
         return []  # subwords can spell any word
 
+    def reads(self, text: str) -> str:
+        """The sentence that is encoded in the place of this one; for an encoder without rules the same."""
+        return text
+
+    def negations(self, text: str) -> list[str]:
+        """Words that deny something and that no training caption contained: their opposite would be imagined."""
+        return []
+
+    def forms_but(self, text: str) -> tuple[str, ...]:
+        """What the training captions looked like, where this sentence, as it is read, looks like none of them."""
+        return ()
+
+    def nothing_said(self, text: str) -> str:
+        """What to tell someone whose sentence has no token."""
+        return f"a text needs at least one word, got {text!r}"
+
     @abstractmethod
     def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
         """Of each token its row in the vocabulary, and the RGB (0..1) that it names; nothing for an empty text."""
@@ -118,7 +134,7 @@ class TextEncoder(nn.Module):
         sentences = [self._rows(text) for text in texts]
         for text, sentence in zip(texts, sentences, strict=True):
             if not sentence:
-                raise ValueError(f"a text needs at least one word, got {text!r}")
+                raise ValueError(self.nothing_said(text))
             self._check_length(len(sentence), "this")
         shape = (len(sentences), max(map(len, sentences), default=1))
         ids_BL, colors_BL3 = torch.full(shape, self.pad), torch.zeros(*shape, 3)

@@ -21,13 +21,15 @@ from torch import Tensor, nn
 
 from textocvp.layers import FeedForward, SelfAttention, sinusoids
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
+from textocvp.text.wording import compile_rules, is_negation, reword, split
 
-# Row 0 is padding, so that a padded batch needs no other bookkeeping.
+# Row 0 is padding, so that a padded batch needs no other bookkeeping. Row 1 is not used: unknown words are left out.
 SPECIAL = ("<pad>", "<unk>", "<color>")
 PAD, UNKNOWN, COLOR = range(3)
 
 
-_WORD = re.compile(r"[a-z0-9']+")
+_WORD = re.compile(r"[a-z0-9']+")  # what a vocabulary may contain
+MOST_FORMS = 32  # captions of more forms than these are free text, whose forms say little
 
 # Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
 # calls #76b7b2 teal; captions of tabletop scenes call it cyan. It goes by both names.
@@ -63,6 +65,10 @@ class WordsConfig(TextConfig):
     vocabulary: tuple[str, ...] = ()
     # Those that no training caption contained: their embeddings are still random.
     untrained: tuple[str, ...] = ()
+    # How other wordings become those of the captions: rules for `textocvp.text.wording.reword`.
+    rewrites: tuple[str, ...] = ()
+    # What the training captions looked like, with {} for a colour; none where nobody listed them.
+    forms: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         wrong = [word for word in self.vocabulary if not _WORD.fullmatch(word)]
@@ -73,18 +79,68 @@ class WordsConfig(TextConfig):
         unknown = [word for word in self.untrained if word not in self.vocabulary]
         if unknown:
             raise ValueError(f"text.untrained: {unknown[0]!r} is not in text.vocabulary")
+        try:
+            compile_rules(self.rewrites)
+        except ValueError as error:
+            raise ValueError(f"text.rewrites: {error}") from None
 
     @property
     def words_have_rgb(self) -> bool:
         return self.kind == "lexicon"
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> WordsConfig:
-        found = {word for caption in captions for word in _WORD.findall(caption.lower())}
+        said = sorted(set(captions))
+        found = {word for caption in said for word in split(caption)}
         new = [word for word in (*vocabulary, *sorted(found)) if _WORD.fullmatch(word)]
         if self.words_have_rgb:  # the lexicon's colours need no embedding
             new = [word for word in new if (word,) not in palette()]
         words = tuple(dict.fromkeys([*self.vocabulary, *new]))  # known words keep their rows
-        return replace(self, vocabulary=words, untrained=tuple(word for word in words if word not in found))
+        return replace(self, vocabulary=words, untrained=words, forms=()).met(said)
+
+    def met(self, captions: Iterable[str]) -> WordsConfig:
+        """That of the same encoder after training on these captions, whose words are in the vocabulary."""
+        said = sorted(set(captions))
+        found = {word for caption in said for word in split(caption)}
+        # Rules that would change what is trained on are those of other captions.
+        own = all(reword(caption, self.rewrites) == split(caption) for caption in said)
+        untrained = tuple(word for word in self.untrained if word not in found)
+        config = replace(self, untrained=untrained, rewrites=self.rewrites if own else ())
+        forms = dict.fromkeys([*self.forms, *(config.form(config.tokens(caption)) for caption in said)])
+        return replace(config, forms=tuple(forms) if len(forms) <= MOST_FORMS else ())
+
+    def tokens(self, text: str) -> list[str]:
+        """A sentence as reworded; for the `lexicon` a name like "light blue" is one token."""
+        found = reword(text, self.rewrites)
+        if not self.words_have_rgb:
+            return found
+        merged, at = [], 0
+        while at < len(found):
+            # Words of the vocabulary stay words, also where some palette calls a colour by one of them.
+            length = 1 if found[at] in self.vocabulary else _color_length(found, at)
+            merged.append(" ".join(found[at : at + length]))
+            at += length
+        return merged
+
+    def form(self, tokens: Iterable[str]) -> str:
+        """What a sentence is like: its tokens, with {} for those that name a colour."""
+        return " ".join("{}" if self._is_color(token) else token for token in tokens)
+
+    def knows(self, token: str) -> bool:
+        """Whether a token has an embedding that was trained, or for the `lexicon` an RGB."""
+        if token in self.vocabulary:
+            return token not in self.untrained
+        return self.words_have_rgb and tuple(token.split()) in palette()
+
+    def _is_color(self, token: str) -> bool:
+        # Without RGB of their own, colours are words of the vocabulary like any other.
+        return tuple(token.split()) in palette() and not (self.words_have_rgb and token in self.vocabulary)
+
+
+def _color_length(words: list[str], at: int) -> int:
+    for length in range(min(_longest_name(), len(words) - at), 1, -1):
+        if tuple(words[at : at + length]) in palette():
+            return length
+    return 1
 
 
 class _Block(nn.Module):
@@ -127,33 +183,36 @@ class WordEncoder(TextEncoder):
         return self.embedding.weight.device
 
     def words(self, text: str) -> list[str]:
-        """The words of a sentence in lower case; for the `lexicon` a name like "light blue" is one word."""
-        found = _WORD.findall(text.lower())
-        if not self.config.words_have_rgb:
-            return found
-        merged, at = [], 0
-        while at < len(found):
-            # Words of the vocabulary stay words, also where some palette calls a colour by one of them.
-            length = 1 if found[at] in self._vocabulary else self._color_length(found, at)
-            merged.append(" ".join(found[at : at + length]))
-            at += length
-        return merged
+        """The tokens of a sentence that are encoded, in order: see `WordsConfig.tokens`.
 
-    def _color_length(self, words: list[str], at: int) -> int:
-        for length in range(min(_longest_name(), len(words) - at), 1, -1):
-            if tuple(words[at : at + length]) in palette():
-                return length
-        return 1
+        Those that it does not know are left out: one that was never trained would say something, but nothing true.
+        """
+        return [token for token in self.config.tokens(text) if self.config.knows(token)]
+
+    def reads(self, text: str) -> str:
+        return " ".join(self.words(text))
+
+    def unknown_words(self, text: str) -> list[str]:
+        return [one for one in dict.fromkeys(self.config.tokens(text)) if not self.config.knows(one)]
+
+    def negations(self, text: str) -> list[str]:
+        return [one for one in split(text) if is_negation(one) and not self.config.knows(one)]
+
+    def forms_but(self, text: str) -> tuple[str, ...]:
+        forms = self.config.forms
+        return () if self.config.form(self.words(text)) in forms else forms
+
+    def nothing_said(self, text: str) -> str:
+        known = [word for word in self.config.vocabulary if self.config.knows(word)]
+        known += ["names of colours"] if self.words_have_rgb else []
+        return (
+            f"a text needs at least one word that the model knows, got {text!r}; it knows {', '.join(known)}"
+        )
 
     def _row_and_color(self, word: str) -> tuple[int, RGB | None]:
         if word in self._vocabulary:
             return self._vocabulary[word], None
-        color = palette().get(tuple(word.split())) if self.config.words_have_rgb else None
-        return (UNKNOWN, None) if color is None else (COLOR, color)
-
-    def unknown_words(self, text: str) -> list[str]:
-        words = dict.fromkeys(self.words(text))
-        return [w for w in words if w in self.config.untrained or self._row_and_color(w)[0] == UNKNOWN]
+        return COLOR, palette()[tuple(word.split())]
 
     def _rows(self, text: str) -> list[tuple[int, RGB | None]]:
         return [self._row_and_color(word) for word in self.words(text)]

@@ -26,7 +26,6 @@ from torch import Tensor, nn
 
 from textocvp.config import with_settings
 from textocvp.data.cache import cached_slots
-from textocvp.data.episodes import words_of
 from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP, check_parts
@@ -246,9 +245,7 @@ def assemble(
         with allowed_settings():
             extend_window(model, args.set)
         if isinstance(config.text, WordsConfig):
-            met = words_of(captions)  # and so trained from now on
-            left = tuple(word for word in config.text.untrained if word not in met)
-            model.text.config = replace(config.text, untrained=left)
+            model.text.config = config.text.met(captions)
             model.config = replace(model.config, text=model.text.config)
         model.text.train()
         model.predictor.train()

@@ -51,11 +51,15 @@ def test_unknown_words_are_named_once_and_in_order():
     assert encoder("transformer").unknown_words("put the red block in the turquoise bowl") == ["turquoise"]
 
 
-def test_words_that_no_caption_contained_are_unknown_too():
+def test_words_that_no_caption_contained_are_unknown_too_and_left_out():
     config = WordsConfig(untrained=("move", "onto"), vocabulary=(*TABLETOP_WORDS, "onto"))
     model = build_text_encoder(config)
     assert model.unknown_words("move the red block onto the blue bowl, move!") == ["move", "onto"]
-    assert model.lookup(["move onto"]).ids_BL.tolist() == [[14, 18]]  # they have rows of their own
+    with_them, without = "move the red block zorble onto the bowl", "the red block the bowl"
+    assert model.words(with_them) == without.split()
+    assert torch.equal(model([with_them]).embeddings_BLC, model([without]).embeddings_BLC)
+    with pytest.raises(ValueError, match=r"got 'move onto'; it knows put, the, .*names of colours"):
+        model(["move onto"])
 
 
 def test_the_vocabulary_is_in_the_configuration():
@@ -108,7 +112,8 @@ def test_colors_of_the_lexicon_differ_in_rgb_only():
 
 def test_a_color_name_of_two_words_is_one_token():
     assert encoder("lexicon").words("Put the light blue block") == ["put", "the", "light blue", "block"]
-    assert encoder("transformer").words("Put the light blue block") == [
+    words = (*WORDS["transformer"], "light")
+    assert encoder("transformer", vocabulary=words).words("Put the light blue block") == [
         "put",
         "the",
         "light",

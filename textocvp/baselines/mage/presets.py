@@ -9,10 +9,10 @@ from textocvp.baselines.mage.axial import AxialConfig
 from textocvp.baselines.mage.model import MageConfig
 from textocvp.baselines.mage.text import PublishedTextConfig
 from textocvp.baselines.mage.vqvae import VQVAEConfig
-from textocvp.presets import TABLETOP_COLORS, TABLETOP_WORDS
+from textocvp.presets import TABLETOP_COLORS, TABLETOP_REWRITES, TABLETOP_WORDS
 from textocvp.text.words import WordsConfig
 
-PUBLISHED_TEXT = PublishedTextConfig(vocabulary=TABLETOP_WORDS + TABLETOP_COLORS)
+PUBLISHED_TEXT = PublishedTextConfig(vocabulary=TABLETOP_WORDS + TABLETOP_COLORS, rewrites=TABLETOP_REWRITES)
 
 MAGE_PRESETS: dict[str, MageConfig] = {
     # The published sizes at 64x64.
@@ -22,7 +22,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
     "mage-small": MageConfig(
         name="mage-small",
         vqvae=VQVAEConfig(channels=64, code_dim=64),
-        text=WordsConfig(vocabulary=TABLETOP_WORDS),
+        text=WordsConfig(vocabulary=TABLETOP_WORDS, rewrites=TABLETOP_REWRITES),
         axial=AxialConfig(dim=128, heads=4, hidden=256, frames=25, patch=2, copy=True),
     ),
     # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).

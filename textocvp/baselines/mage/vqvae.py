@@ -243,6 +243,7 @@ class VQVAE(nn.Module):
 
 def perplexity(counts_K: Tensor) -> float:
     """How many codes are used, effectively: the exponential of the entropy of their frequencies (K)."""
+    counts_K = counts_K.cpu()  # float64 is not on every device
     share_K = counts_K[counts_K > 0].double() / counts_K.sum()
     return exp(-float((share_K * share_K.log()).sum()))
 

@@ -54,7 +54,7 @@ def test_the_bundled_one_is_its_preset_and_imagines_through_the_common_door() ->
     frames = model.imagine(picture, TEXTS[0], horizon=2)
     assert frames.shape == (1, 3, 3, 64, 64) and frames.min() >= 0 and frames.max() <= 1
     config, preset = model.model.config, mage_preset("mage-small")  # type: ignore[attr-defined]
-    assert replace(config, text=replace(config.text, untrained=())) == preset
+    assert replace(config, text=replace(config.text, untrained=(), forms=())) == preset
     assert config.text.untrained == config.text.vocabulary[5:]  # all but "put the block in bowl"
     with pytest.raises(ValueError, match="horizon"):
         model.imagine(picture, TEXTS[0], horizon=25)
