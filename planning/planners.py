@@ -183,6 +183,11 @@ class BeamPlanner(_LooksAtMasks):
         return [sum(scores_n) / count for scores_n in scores_Bn]
 
 
+InstructionPlanner = (
+    BeamPlanner  # what the planner of goals of one instruction was called when it stood alone
+)
+
+
 @dataclass
 class RandomPlanner(_LooksAtMasks):
     """The control row: random instructions, imagined only to be carried out. See `BeamPlanner` for the other options.

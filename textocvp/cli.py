@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
-import numpy as np
 import torch
 import tyro
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 from rich.console import Console
 from rich.table import Table
 from rich.tree import Tree
@@ -31,10 +30,10 @@ from textocvp.checkpoint import (
 )
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
-from textocvp.inputs import times_larger
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
+from textocvp.pictures import read_picture
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
 from textocvp.pretrained import WeightsError
 from textocvp.protocols import load_model
@@ -75,7 +74,9 @@ class RolloutCommand:
     seed: int = 0
     """Of the initial slots, for models that draw them at random."""
     resize: bool = False
-    """Shrink or enlarge the picture to the size the model was trained on, instead of refusing another size."""
+    """Bring the picture to the size that the model was trained on, with a border where its shape is another."""
+    crop: bool = False
+    """The same, but cut off what does not fit its shape."""
     device: str = "cpu"
     """Where to compute: cpu, cuda, mps."""
 
@@ -219,29 +220,35 @@ def _rollout(command: RolloutCommand) -> None:
     if command.out.suffix.lower() not in SUFFIXES:
         raise Mistake(f"--out {command.out}: the name must end in {', '.join(SUFFIXES)}")
     try:
-        picture = Image.open(command.image).convert("RGB")
-    except FileNotFoundError:
-        raise Mistake(f"there is no picture {command.image}") from None
-    except (UnidentifiedImageError, OSError) as error:
-        raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
-    try:
         world_model = WorldModel.from_pretrained(command.checkpoint, command.device)
     # What torch raises for a device that it does not know or have.
     except (RuntimeError, AssertionError) as error:
         raise Mistake(f"--device {command.device} cannot be used: {error}") from error
-    H, W = world_model.image_size
-    if command.resize:
-        picture = picture.resize((W, H), Image.Resampling.BOX)
-    elif times_larger((picture.height, picture.width), (H, W)) == 0:
-        raise Mistake(
-            f"{command.image} is {picture.size[0]}x{picture.size[1]} pixels and the model was trained on "
-            f"{W}x{H}: take the picture at that size or a whole multiple of it, or add --resize"
+    texts = (command.text, *command.more_texts)
+    if len(texts) > 1 and not any(" " in text for text in texts):
+        texts = (" ".join(texts),)
+        print(
+            f"took the words for one sentence, {texts[0]!r}; several sentences need quotes", file=sys.stderr
         )
     try:
-        texts = (command.text, *command.more_texts)
-        imagined = world_model.rollout(np.asarray(picture), texts, horizon=command.horizon, seed=command.seed)
+        picture, done = read_picture(
+            command.image, world_model.image_size, resize=command.resize, crop=command.crop
+        )
+    except FileNotFoundError:
+        raise Mistake(f"there is no picture {command.image}") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
+    except ValueError as error:
+        raise Mistake(f"{command.image} cannot be taken: {error}") from error
+    for what in done:
+        print(f"{command.image}: {what}")
+    try:
+        imagined = world_model.rollout(picture, texts, horizon=command.horizon, seed=command.seed)
     except ValueError as error:
         raise Mistake(str(error)) from error
+    for text in texts:
+        if (read := world_model.model.text.reads(text)) != text:
+            print(f"{text!r} is read as {read!r}")
     print(imagined)
     print(f"wrote {imagined.save(command.out)}")
 

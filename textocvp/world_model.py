@@ -17,9 +17,11 @@ from textocvp.inputs import (
     checked_frames,
     checked_horizon,
     checked_pairs,
+    checked_seed,
     checked_texts,
     observed_images,
     times_larger,
+    warn_of_absent,
     warn_of_foreign,
 )
 from textocvp.metrics.frames import psnr
@@ -99,7 +101,8 @@ class WorldModel:
                 slots; what is drawn with the first frame in mind still is.
             text: what is to be done.
             horizon: how many frames to imagine after the one that is seen.
-            seed: of the initial slots, where they are drawn at random. The same seed gives the same rollout.
+            seed: of the initial slots, where they are drawn at random: a whole number from 0 to 2**64 - 1. The same
+                seed gives a scene the same rollout, alone and among others.
             num_slots: how many slots to look for in an image, background included. The configured number by default;
                 more for scenes of more things than the model was trained with.
             attention: also keep the attention from slots to words.
@@ -164,7 +167,12 @@ class WorldModel:
         B = checked_pairs(len(start), len(texts))
         texts = texts * B if len(texts) == 1 else texts
         seed_B1KD = start.slots[:, -1:].to(self.model.device).expand(B, -1, -1, -1)
-        tokens = self.model.text(texts)
+        words = self.model.text.lookup(texts)
+        # Only of what is seen, not imagined; too few slots do not show everything.
+        if not start.texts and start.slots.shape[2] >= self.model.config.parser.num_slots:
+            seen_BKD, layout = start.slots[:, -1].to(self.model.device), start.layout
+            warn_of_absent(seen_BKD, layout, words, texts, self.model.text, depth=4)
+        tokens = self.model.text.encode(words)
         imagined = predictor.rollout(seed_B1KD, tokens, horizon, return_attention=attention)
         slots_BTKD = torch.cat([seed_B1KD, imagined.slots_BSKD], dim=1).float()
         seen = start.seen * B if start.seen is not None and len(start) == 1 else start.seen
@@ -227,8 +235,9 @@ class WorldModel:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
         model = self.model
-        # One for each scene: where it stands in a batch must not matter.
-        generators = [torch.Generator(device=model.device).manual_seed(int(seed)) for _ in frames_BT3HW]
+        # One for each clip and all alike, so that what is drawn for a clip does not depend on its place among others.
+        seed, clips = checked_seed(seed), len(frames_BT3HW)
+        generator = [torch.Generator(device=model.device).manual_seed(seed) for _ in range(clips)]
         own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
         parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generators)
         slots_BTKD = parsed.slots_BTKD.float()

@@ -9,9 +9,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import envs  # noqa: F401  (registers the environments)
 from planning import (
+    AppearanceGrounder,
     BeamPlanner,
     Controller,
     Goal,
@@ -225,3 +227,36 @@ def test_the_wrong_control_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="primitive"):
         run_episode(env, one_step(oracle_for(env, 0)), seed=0)
     env.close()
+
+
+def test_a_goal_may_be_a_sentence(env: gym.Env[Any, Any]) -> None:
+    obs, info = env.reset(seed=2)
+    text, planner = info["instruction"], one_step(oracle_for(env, 2))
+    assert run_episode(env, planner, text, seed=2).success
+    with pytest.raises(ValueError, match="cannot read 'do not"):
+        run_episode(env, planner, f"do not {text}", seed=2)
+    with pytest.raises(TypeError, match=rf"give Goal.parse\('{text}'\)"):
+        planner.plan(obs["rgb"], text, AppearanceGrounder.from_info(info))
+
+
+def test_float64_is_asked_for_on_the_cpu_only(
+    env: gym.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Apple's GPUs have none, so the tensor must have been brought to the CPU before."""
+    cpu, double = torch.Tensor.cpu, torch.Tensor.double
+    on_cpu: list[torch.Tensor] = []
+    asked: list[bool] = []
+
+    def watched_cpu(tensor: torch.Tensor) -> torch.Tensor:
+        on_cpu.append(cpu(tensor))
+        return on_cpu[-1]
+
+    def watched_double(tensor: torch.Tensor) -> torch.Tensor:
+        asked.append(any(tensor is known for known in on_cpu))
+        return double(tensor)
+
+    planner = one_step(oracle_for(env, 2))
+    monkeypatch.setattr(torch.Tensor, "cpu", watched_cpu)
+    monkeypatch.setattr(torch.Tensor, "double", watched_double)
+    run_episode(env, planner, seed=2)
+    assert asked and all(asked)

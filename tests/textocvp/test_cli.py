@@ -60,6 +60,33 @@ def test_another_picture_size_is_refused_or_resized(capsys, tmp_path, checkpoint
     assert np.array_equal(iio.imread(tmp_path / "large-out.png"), iio.imread(tmp_path / "same.png"))
 
 
+def test_words_without_quotes_are_one_sentence(capsys, tmp_path, checkpoint, picture) -> None:
+    rest = ["--checkpoint", checkpoint, "--horizon", "1", "--out"]
+    assert cli.main(["rollout", picture, *TEXT.split(), *rest, str(tmp_path / "words.png")]) == 0
+    printed = capsys.readouterr()
+    assert "B=1 sequences" in printed.out and repr(TEXT) in printed.err and "need quotes" in printed.err
+    assert cli.main(["rollout", picture, TEXT, *rest, str(tmp_path / "quoted.png")]) == 0
+    assert "read as" not in capsys.readouterr().out
+    assert (tmp_path / "words.png").read_bytes() == (tmp_path / "quoted.png").read_bytes()
+
+
+def test_what_was_done_to_picture_and_words_is_said(capsys, tmp_path, checkpoint, scene) -> None:
+    wide = np.concatenate(
+        [np.full((32, 16, 3), 47, np.uint8), scene, np.full((32, 16, 3), 47, np.uint8)], axis=1
+    )
+    iio.imwrite(tmp_path / "wide.png", wide)
+    iio.imwrite(tmp_path / "scene.png", scene)
+    arguments = [TEXT.upper(), "--checkpoint", checkpoint, "--horizon", "1", "--out"]
+    wide_out, out = str(tmp_path / "a.png"), str(tmp_path / "b.png")
+    assert "or --crop" in says(capsys, ["rollout", str(tmp_path / "wide.png"), *arguments, wide_out], 1)
+    assert cli.main(["rollout", str(tmp_path / "wide.png"), *arguments, wide_out, "--crop"]) == 0
+    printed = capsys.readouterr().out
+    assert "wide.png: cut off its edges and brought it from 64x32 to 32x32 pixels" in printed
+    assert f"{TEXT.upper()!r} is read as {TEXT!r}" in printed
+    assert cli.main(["rollout", str(tmp_path / "scene.png"), *arguments, out]) == 0
+    assert Path(wide_out).read_bytes() == Path(out).read_bytes()
+
+
 def test_unknown_words_are_a_warning_line(capsys, tmp_path, checkpoint, picture) -> None:
     arguments = ["rollout", picture, "put the flurb block in the bowl", "--checkpoint", checkpoint]
     assert cli.main([*arguments, "--horizon", "1", "--out", str(tmp_path / "a.png")]) == 0
@@ -72,6 +99,7 @@ def test_unknown_words_are_a_warning_line(capsys, tmp_path, checkpoint, picture)
         ({"picture": "nowhere.png"}, "no picture nowhere.png"),
         ({"picture": __file__}, "no picture that can be read"),
         ({"text": " "}, "empty text"),
+        ({"text": "do not put the red block in the blue bowl"}, "says 'not'"),
         ({"horizon": "0"}, "at least 1"),
         ({"horizon": "99"}, "at most 8"),
         ({"out": "film.webm"}, ".gif, .mp4, .png"),

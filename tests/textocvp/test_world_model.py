@@ -138,6 +138,7 @@ def test_videos_are_parsed_one_or_many(world_model: WorldModel, scene: np.ndarra
         (lambda s: s.astype(np.float32), TypeError, r"uint8 .* not float32; .* image\.round\(\)\.astype"),
         (lambda s: s / 255.0, TypeError, r"\(image \* 255\)"),
         (lambda s: s.astype(np.int64), TypeError, "int64"),
+        (lambda s: s.astype(np.uint16) * 257, TypeError, r"\(image // 257\)"),
         (lambda s: (s > 50).astype(np.uint8), ValueError, "only the values 0 and 1"),
         (lambda s: s[..., 0], ValueError, r"\(H, W, 3\).*\(32, 32\)"),
         (lambda s: s.transpose(2, 0, 1), ValueError, "three colours last"),
@@ -192,6 +193,58 @@ def test_a_word_it_has_never_met_is_a_warning_that_names_it(placed_world_model, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         placed_world_model.rollout(scene, TEXT, horizon=1)
+
+
+def test_a_thing_that_nothing_answers_to_is_a_warning_that_names_the_nearest(
+    placed_world_model, scene
+) -> None:
+    text, again = "put the green block in the blue bowl", "put the red block in the blue bowl"
+    with pytest.warns(
+        UserWarning, match="nothing seen is 'green'; the nearest is '(blue|red)' and"
+    ) as caught:
+        seen = placed_world_model.rollout(scene, [again, text], horizon=1)
+    assert repr(text) in str(caught[0].message) and len(caught) == 1
+    assert Path(caught[0].filename).name == "test_world_model.py"  # points at the caller
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        placed_world_model.rollout(seen, text, horizon=1)  # what is imagined may change its looks
+        placed_world_model.rollout(scene, text, horizon=1, num_slots=2)  # which do not show everything
+    with pytest.warns(UserWarning, match="nothing seen is 'purple'"):
+        placed_world_model.rollout(placed_world_model.parse(scene[None]), "put the purple block", horizon=1)
+
+
+def test_a_scene_does_not_know_its_place_among_others(world_model: WorldModel, scene: np.ndarray) -> None:
+    """Also where the first slots are drawn at random."""
+    scenes = np.stack([scene[::-1], scene[:, ::-1], scene])
+    together = world_model.rollout(scenes, TEXT, horizon=2, seed=4)
+    alone = world_model.rollout(scene, TEXT, horizon=2, seed=4)
+    torch.testing.assert_close(together.slots[[2]], alone.slots, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", [None, -1, 2**64, 1.0, True, "0"])
+def test_what_is_no_seed_is_refused(placed_world_model, scene, seed) -> None:
+    with pytest.raises(ValueError, match=rf"seed must be a whole number from 0 to .*, not {seed!r}"):
+        placed_world_model.rollout(scene, TEXT, horizon=1, seed=seed)
+
+
+def test_a_seed_may_be_numpys(world_model: WorldModel, scene: np.ndarray) -> None:
+    same = [world_model.parse(scene[None], seed=seed).slots for seed in (7, np.int64(7), np.uint8(7))]
+    assert torch.equal(same[0], same[1]) and torch.equal(same[0], same[2])
+    world_model.parse(scene[None], seed=2**64 - 1)
+
+
+def test_frames_of_a_stack_are_no_scenes(placed_world_model: WorldModel, scene: np.ndarray) -> None:
+    frames = np.stack([scene, scene, np.roll(scene, 1, axis=1)])
+    obs = {"rgb": frames, "instruction": (TEXT,) * 3}
+    with pytest.raises(ValueError, match=r"3 frames of one scene, .*obs\['rgb'\]\[-1\]"):
+        placed_world_model.rollout(obs, TEXT, horizon=1)
+    for scenes in (
+        {**obs, "instruction": (TEXT, TEXT, "put the blue block in the red bowl")},  # of three environments
+        {**obs, "rgb": np.stack([scene, np.roll(scene, 12, axis=1), scene[::-1]])},
+        {"rgb": frames},
+        frames,
+    ):
+        assert len(placed_world_model.rollout(scenes, TEXT, horizon=1)) == 3
 
 
 def test_a_folder_is_a_checkpoint(tmp_path: Path, scene: np.ndarray) -> None:

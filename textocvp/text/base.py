@@ -114,6 +114,10 @@ class TextEncoder(nn.Module):
         """What the training captions looked like, where this sentence, as it is read, looks like none of them."""
         return ()
 
+    def color_name(self, rgb: Sequence[float]) -> str:
+        """The nearest name of a colour, RGB 0..1, among common ones."""
+        raise NotImplementedError(f"{type(self).__name__} knows no colours")
+
     def nothing_said(self, text: str) -> str:
         """What to tell someone whose sentence has no token."""
         return f"a text needs at least one word, got {text!r}"

@@ -9,27 +9,10 @@ import re
 from functools import lru_cache
 
 # Whoever has never read one of these imagines the opposite of what is said.
-NEGATIONS = frozenset(
-    [
-        "not",
-        "no",
-        "never",
-        "nor",
-        "neither",
-        "none",
-        "nothing",
-        "without",
-        "except",
-        "avoid",
-        "cannot",
-        "cant",
-        "dont",
-        "doesnt",
-        "mustnt",
-        "shouldnt",
-        "wont",
-    ]
-)
+NEGATIONS = frozenset((
+    "not", "no", "never", "nor", "neither", "none", "nothing", "without", "except", "avoid", "cannot", "cant", "dont",
+    "doesnt", "mustnt", "shouldnt", "wont",
+))  # fmt: skip
 
 _WORD = re.compile(r"[\w']+")  # of any script: what cannot be read is to be named
 _NAME = re.compile(r"{([a-z]+)}")

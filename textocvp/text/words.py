@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -201,6 +201,9 @@ class WordEncoder(TextEncoder):
     def forms_but(self, text: str) -> tuple[str, ...]:
         forms = self.config.forms
         return () if self.config.form(self.words(text)) in forms else forms
+
+    def color_name(self, rgb: Sequence[float]) -> str:
+        return min((*TABLEAU_10, "white", "black"), key=lambda name: math.dist(palette()[name,], rgb))
 
     def nothing_said(self, text: str) -> str:
         known = [word for word in self.config.vocabulary if self.config.knows(word)]

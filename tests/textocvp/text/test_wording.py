@@ -137,7 +137,7 @@ def test_forms_are_learned_from_captions_and_foreign_rules_dropped() -> None:
     own = config.for_captions(
         [PLAIN, "put the gray block in the white bowl", "put the cyan block on the red block"]
     )
-    assert own.forms == ("put the {} block in the {} bowl", "put the {} block on the {} block")
+    assert set(own.forms) == {"put the {} block in the {} bowl", "put the {} block on the {} block"}
     assert own.rewrites == TABLETOP_REWRITES and "on" not in own.untrained
     later = own.met(["put the red block with the green block"])
     assert later.forms == (*own.forms, "put the {} block with the {} block")
