@@ -125,7 +125,11 @@ AnyGoal = Goal | PictureGoal
 
 
 def _forms() -> str:
-    return " or ".join(f"'put {relation.template}'" for relation in RELATIONS.values())
+    each = (
+        relation.template.format(thing=f"<color> {relation.kinds[0]}", target=f"<color> {relation.kinds[1]}")
+        for relation in RELATIONS.values()
+    )
+    return " or ".join(f"'put {form}'" for form in each)
 
 
 def _parse(text: str) -> tuple[Instruction, ...]:

@@ -46,7 +46,10 @@ def test_a_goal_is_read_as_a_whole_or_refused_with_its_text_and_the_forms(text: 
         Goal.parse(text)
     message = str(refused.value)
     assert f"cannot read {unread!r} in the goal {text!r}" in message
-    assert "'put the {thing} in the {target}' or 'put the {thing} on the {target}'" in message
+    assert (
+        "'put the <color> block in the <color> bowl' or 'put the <color> block on the <color> block'"
+        in message
+    )
 
 
 def test_a_goal_of_several_sentences_in_capitals_with_names_of_two_words() -> None:

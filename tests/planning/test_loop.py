@@ -26,6 +26,7 @@ from planning import (
     SegmentationGrounder,
     run_episode,
 )
+from planning.controller import slot_center
 from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 from textocvp.rollout import Rollout
@@ -255,8 +256,8 @@ def test_float64_is_asked_for_on_the_cpu_only(
         asked.append(any(tensor is known for known in on_cpu))
         return double(tensor)
 
-    planner = one_step(oracle_for(env, 2))
+    parsed = oracle_for(env, 2).parse(env.reset(seed=2)[0]["rgb"][None])
     monkeypatch.setattr(torch.Tensor, "cpu", watched_cpu)
     monkeypatch.setattr(torch.Tensor, "double", watched_double)
-    run_episode(env, planner, seed=2)
+    slot_center(parsed, [0, 1], 0)
     assert asked and all(asked)
