@@ -111,7 +111,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
         max_steps: steps until truncation; by default 3 primitives (`RearrangeBlocks-v0`: 8) for each goal pair, or
             as many frames as they may take.
-        extras: further observations, of "depth", "segmentation", "proprio".
+        extras: further observations, one or several of "depth", "segmentation", "proprio".
         place_yaw: whether a primitive has a fifth value.
         record_frames: whether `info` holds all frames of a step.
         render_mode: "rgb_array" (`render` gives the newest frame), "rgb_array_list" (all frames since the last
@@ -141,7 +141,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_stride: int = 16,
         physics_hz: int | None = None,
         max_steps: int | None = None,
-        extras: Sequence[str] = (),
+        extras: str | Sequence[str] = (),
         place_yaw: bool = False,
         record_frames: bool = False,
         render_mode: str | None = None,
@@ -167,6 +167,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             )
         self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        extras = (extras,) if isinstance(extras, str) else extras
         for extra in extras:
             check_choice("extras", extra, EXTRAS)
         check_range("image_size", image_size, 16, 2048, whole=True)

@@ -235,9 +235,9 @@ class WorldModel:
         if num_slots is not None and (not isinstance(num_slots, (int, np.integer)) or num_slots < 1):
             raise ValueError(f"num_slots must be a whole number of at least 1 slot, not {num_slots!r}")
         model = self.model
-        # One for each clip and all alike, so that what is drawn for a clip does not depend on its place among others.
-        seed, clips = checked_seed(seed), len(frames_BT3HW)
-        generator = [torch.Generator(device=model.device).manual_seed(seed) for _ in range(clips)]
+        # One for each scene: where it stands in a batch must not matter.
+        seed = checked_seed(seed)
+        generators = [torch.Generator(device=model.device).manual_seed(seed) for _ in frames_BT3HW]
         own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
         parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generators)
         slots_BTKD = parsed.slots_BTKD.float()

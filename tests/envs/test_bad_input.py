@@ -127,6 +127,7 @@ def test_wrong_tool_motions_are_refused_before_anything_moves(make: Make, action
         ({"control": "joints"}, "unknown control 'joints'; allowed: 'primitive', 'ee'"),
         ({"camera": "top"}, "unknown camera 'top'; allowed: 'paper', 'close'"),
         ({"render_mode": "ansi"}, "unknown render_mode 'ansi'"),
+        ({"extras": "lidar"}, "unknown extras 'lidar'; allowed"),
         ({"extras": ("lidar",)}, "unknown extras 'lidar'; allowed: 'depth', 'segmentation', 'proprio'"),
         ({"image_size": 4}, "image_size must be a whole number of 16 to 2048, not 4"),
         ({"image_size": 64.5}, "image_size must be a whole number"),

@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 
 import envs  # noqa: F401  (registers the environments)
 from planning import (
@@ -26,7 +25,6 @@ from planning import (
     SegmentationGrounder,
     run_episode,
 )
-from planning.controller import slot_center
 from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 from textocvp.rollout import Rollout
@@ -238,26 +236,3 @@ def test_a_goal_may_be_a_sentence(env: gym.Env[Any, Any]) -> None:
         run_episode(env, planner, f"do not {text}", seed=2)
     with pytest.raises(TypeError, match=rf"give Goal.parse\('{text}'\)"):
         planner.plan(obs["rgb"], text, AppearanceGrounder.from_info(info))
-
-
-def test_float64_is_asked_for_on_the_cpu_only(
-    env: gym.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Apple's GPUs have none, so the tensor must have been brought to the CPU before."""
-    cpu, double = torch.Tensor.cpu, torch.Tensor.double
-    on_cpu: list[torch.Tensor] = []
-    asked: list[bool] = []
-
-    def watched_cpu(tensor: torch.Tensor) -> torch.Tensor:
-        on_cpu.append(cpu(tensor))
-        return on_cpu[-1]
-
-    def watched_double(tensor: torch.Tensor) -> torch.Tensor:
-        asked.append(any(tensor is known for known in on_cpu))
-        return double(tensor)
-
-    parsed = oracle_for(env, 2).parse(env.reset(seed=2)[0]["rgb"][None])
-    monkeypatch.setattr(torch.Tensor, "cpu", watched_cpu)
-    monkeypatch.setattr(torch.Tensor, "double", watched_double)
-    slot_center(parsed, [0, 1], 0)
-    assert asked and all(asked)
