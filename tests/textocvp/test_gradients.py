@@ -25,11 +25,12 @@ from textocvp.training.predictor import PredictorStage, PredictorTraining, assem
 )
 def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig) -> None:
     nowhere = Path()
-    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=nowhere), build(config))
+    texts = ["put the red block in the blue bowl", "put the green block in the gray bowl"]
+    model = assemble(PredictorTraining(nowhere, nowhere, nowhere, parser=nowhere), build(config), texts)
     frames_B1 = torch.rand(2, 1, 3, 32, 32) * 2 - 1
     frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
     slots_B1KD = model.parser(frames_B1).slots_BTKD
-    words = model.text.lookup(["put the red block in the blue bowl", "put the green block in the gray bowl"])
+    words = model.text.lookup(texts)
     predicted_BSKD = PredictorStage(model)(slots_B1KD, words, 2)
     drawn = model.renderer(predicted_BSKD[:, -1]).frames_B3HW
     (drawn - frames_B1[:, 0].flip(-1)).square().mean().backward()
