@@ -203,7 +203,7 @@ class WordEncoder(TextEncoder):
         return () if self.config.form(self.words(text)) in forms else forms
 
     def color_name(self, rgb: Sequence[float]) -> str:
-        return min((*TABLEAU_10, "white", "black"), key=lambda name: math.dist(palette()[name,], rgb))
+        return min(sorted((*TABLEAU_10, "white", "black")), key=lambda name: math.dist(palette()[name,], rgb))
 
     def nothing_said(self, text: str) -> str:
         known = [word for word in self.config.vocabulary if self.config.knows(word)]

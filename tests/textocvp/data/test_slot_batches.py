@@ -13,6 +13,7 @@ from tests.textocvp.slot_scenes import LAYOUT, scenes
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.data.episodes import EpisodeFile
 from textocvp.data.slot_batches import SlotBatches, true_frames
+from textocvp.presets import TABLETOP_COLORS, TABLETOP_WORDS
 from textocvp.slots import SlotState
 from textocvp.text import build_text_encoder
 from textocvp.text.words import WordsConfig
@@ -37,7 +38,8 @@ def test_recoloring_permutes_scene_and_words_alike():
 
 def test_words_without_rgb_stop_all_recoloring() -> None:
     """Else "red" would be taught to mean whatever colour the red block was given."""
-    text = build_text_encoder(WordsConfig(kind="transformer", dim=16, heads=2, hidden=16))
+    words = TABLETOP_WORDS + TABLETOP_COLORS
+    text = build_text_encoder(WordsConfig("transformer", dim=16, heads=2, hidden=16, vocabulary=words))
     a, b = (batches(text, recolor=recolor).draw(np.random.default_rng(5), 12) for recolor in (False, True))
     assert torch.equal(a.slots_BTKD, b.slots_BTKD)
     assert torch.equal(b.channels_B3, torch.arange(3).expand(12, 3))  # the frames of an image loss stay, too
