@@ -22,7 +22,7 @@ import torch
 
 from experiments.report.page import CardSpec, Clips, Figure, Section
 from experiments.report.plots import curve_plot, plot_table
-from experiments.report.results import Results
+from experiments.report.results import EpisodeLine, Results
 from experiments.report.rows import Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import PredictionClip, episode_clips
@@ -32,7 +32,15 @@ from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import hold_last
 from experiments.study.run import Found, FullArgs, Part, Run, Study, start
-from experiments.study.scenes import LONG_GOALS, StudyScene, play_expert, sample_scene, study_scenes
+from experiments.study.scenes import (
+    LONG_GOALS,
+    StudyScene,
+    place_of,
+    play_expert,
+    sample_scene,
+    scene_hash,
+    study_scenes,
+)
 from planning import RELATIONS, THRESHOLDS, AppearanceGrounder, Instruction
 
 VARIANTS = 3
@@ -87,6 +95,16 @@ class PredictedOutcome:
     verdicts: Mapping[str, Verdicts]
     imagined_TV: np.ndarray  # block to bowl distance in pixels over time for the first slot seed
     true_TV: np.ndarray  # the same of the true frames
+
+    @property
+    def lines(self) -> list[EpisodeLine]:
+        """For `results.json`."""
+        scene, metric = self.scene, "predicted_success"
+        return [
+            EpisodeLine(method, place_of(scene, v), metric, scene_hash(scene), scene.seed, text, float(rate))
+            for method, verdicts in self.verdicts.items()
+            for v, (text, rate) in enumerate(zip(self.texts, verdicts.success_SV.mean(0), strict=True))
+        ]
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,14 @@
 
     python experiments/imagination.py              # default: about 25 minutes on 2 cores
     python experiments/imagination.py --quick      # a first look
+    python experiments/imagination.py --retrained runs/outcome-1/checkpoint --retrained runs/outcome-2/checkpoint
 
 Goals in `RearrangeBlocks-v0`: blocks in bowls that are taken, blocks that carry another, blocks that are to change
 places, towers, and pictures of other arrangements. Ours searches sequences of sentences, and asks the world model where
 each leads. Beside it: the goal's own sentences without any imagination; the same search by a robot that believes every
 sentence; any sentence at random; and a search in the simulator itself. The simulator alone judges, strictly: what
-carries what, everything at rest, the gripper back home. Writes `results.json`, `timings.json`, `report.html`, plots and
-clips into `--out`.
+carries what, everything at rest, the gripper back home. `--retrained` measures checkpoints of other training seeds in
+the same scenes. Writes `results.json`, `timings.json`, `report.html`, plots and clips into `--out`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
+from statistics import fmean
+from time import perf_counter
 from typing import Any, cast
 
 import numpy as np
+import torch
+import tyro
 
 from envs import Expert
 from envs.splits import SPLITS
@@ -28,14 +34,14 @@ from envs.tasks.rearrange import FAMILIES, Rearrange
 from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.plots import plot_table
-from experiments.report.results import Results
-from experiments.report.rows import Key, Row, mean_row, rate_row
+from experiments.report.results import EpisodeLine, Results
+from experiments.report.rows import Key, Row, by_key, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import tone
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import to_uint8
-from experiments.study.run import Found, Part, Run, Study, UsageError, start
-from experiments.study.scenes import SCENES_PER_SEED, StudyScene
+from experiments.study.run import Found, Part, Run, Study, StudyArgs, UsageError, start
+from experiments.study.scenes import SCENES_PER_SEED, StudyScene, scene_hash
 from planning import (
     AnyGoal,
     AnySentencePlanner,
@@ -44,6 +50,8 @@ from planning import (
     EpisodeResult,
     Foresees,
     Goal,
+    Grounder,
+    Grounding,
     LiteralController,
     LiteralPlanner,
     PictureGoal,
@@ -51,12 +59,17 @@ from planning import (
     SearchPlanner,
     SegmentationGrounder,
     Thing,
+    Wanted,
     observe,
     places,
     run_episode,
     seen_supports,
 )
+from planning.masks import centroids
 from textocvp import WorldModel
+from textocvp.checkpoint import WEIGHTS_FILE
+from textocvp.protocols import LoadCheckpoint, LoadModel
+from textocvp.rollout import Rollout
 
 FIRST, APART = 5_000, 500  # seeds of the test split that no other study uses: so many for each family
 OUTCOMES = "outcomes"  # the part of sentences whose ends are foreseen
@@ -69,7 +82,41 @@ CASES = ("plain", "occupied", "covered", "both")
 """What a sentence finds: nothing on the thing and nothing at the target; something at the target, on the thing, or at
 both."""
 BUDGETS = (15, 60, 250, 1000)
+TIMED, TIMES = 30, 15  # so many sentences, so often
 MakeSearch = Callable[[Foresees, int], Planner]
+
+
+@dataclass
+class Args(StudyArgs):
+    """Arguments of this study."""
+
+    retrained: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Folder of a checkpoint of another training seed, to measure beside the first."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.retrained:
+            if not (Path(name) / WEIGHTS_FILE).is_file():
+                raise UsageError(
+                    f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}"
+                )
+
+
+@dataclass
+class TrueSlotsPlanner(SearchPlanner):
+    """The same search, but slots are named and placed by the simulator's segmentation. A ceiling row."""
+
+    def look(self, rgb: np.ndarray, goal: AnyGoal, grounder: Grounder) -> tuple[Rollout, Grounding, Wanted]:
+        """See `SearchPlanner.look`; what hides in the picture stays where it was parsed."""
+        parsed, grounding, wanted = super().look(rgb, goal, grounder)
+        assert isinstance(grounder, SegmentationGrounder)
+        positions_1K2 = parsed.positions[:, -1].clone()
+        for item in grounder.objects:
+            slots = list(grounding.things.get(Thing(item["color"], item["kind"]), ()))
+            mask_HW = torch.as_tensor(grounder.segmentation == item["label"])
+            if slots and mask_HW.any():
+                positions_1K2[:, slots] = centroids(mask_HW)
+        return parsed.moved(positions_1K2, [""]).last, grounding, wanted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,9 +144,9 @@ LINES: dict[str, Searcher] = {
                  plan=lambda model, seed: BelievingPlanner(model)),
         Searcher(key="random", kind="control", hue=5, note="any sentence that the scene allows",
                  plan=lambda model, seed: AnySentencePlanner(model, rng=np.random.default_rng(seed))),
-        Searcher(key="ours, privileged", kind="ceiling", hue=3, privileged=True, pictures=False,
-                 note="the same, but slots are named by the simulator's segmentation",
-                 plan=_with_budget(BUDGETS[-1])),
+        Searcher(key="ours, slots from the simulator", kind="ceiling", hue=3, privileged=True, pictures=False,
+                 note="the same, but slots are named and placed by the simulator's segmentation",
+                 plan=lambda model, seed: TrueSlotsPlanner(model, budget=BUDGETS[-1])),
         Searcher(key="simulator", kind="ceiling", hue=1, note="searches in a copy of the simulator, knows every pose"),
     )
 }  # fmt: skip
@@ -109,6 +156,12 @@ CURVE = {
     for budget in BUDGETS[:-1]
 }
 CURVE_FAMILIES = ("swap", "picture")
+SEEDS = "ours, over training seeds"
+
+
+def retrained(names: Sequence[str]) -> dict[str, str]:
+    """Lines of checkpoints of other training seeds: key -> checkpoint."""
+    return {f"retrained {i}": name for i, name in enumerate(names, 1)}
 
 
 @dataclass(frozen=True)
@@ -138,6 +191,13 @@ class Played:
     seconds: tuple[float, ...]  # of each plan
     error: str | None = None
 
+    @property
+    def lines(self) -> list[EpisodeLine]:
+        """For `results.json`."""
+        of, scene = self.episode, self.episode.scene
+        place = of.method, of.family, SUCCESS, scene_hash(scene), scene.seed
+        return [EpisodeLine(*place, self.goal, float(self.success), self.said, self.error)]
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -146,6 +206,7 @@ class Episode:
     method: str
     scene: StudyScene
     seed: int
+    load: LoadModel | None = None  # makes the world model; by default the study's own
 
     @property
     def family(self) -> str:
@@ -155,7 +216,7 @@ class Episode:
     @property
     def searcher(self) -> Searcher:
         """Who acts."""
-        return {**LINES, **CURVE}[self.method]
+        return {**LINES, **CURVE}[self.method if self.load is None else OURS]
 
     def run(self, worker: Worker) -> Played:
         """Play it."""
@@ -189,9 +250,10 @@ class Episode:
         searcher = self.searcher
         assert searcher.plan is not None
         goal = goal_of(observation, info)
+        model = worker.world_model if self.load is None else worker.model(self.load)
         return run_episode(
             worker.environment(self.scene),
-            searcher.plan(cast(Foresees, worker.world_model), self.scene.seed),
+            searcher.plan(cast(Foresees, model), self.scene.seed),
             goal,
             ground=(SegmentationGrounder if searcher.privileged else AppearanceGrounder).from_info,
             controller=LiteralController,
@@ -212,6 +274,7 @@ def goal_of(observation: Mapping[str, Any], info: Mapping[str, Any]) -> AnyGoal:
 class Foreseen:
     """What was foreseen of one scene: for each case, of each sentence whether it was right."""
 
+    method: str
     right: Mapping[str, Sequence[bool]]
 
 
@@ -221,13 +284,16 @@ class Foresight:
 
     scene: StudyScene
     seed: int
+    method: str = OURS
+    load: LoadModel | None = None  # as of `Episode`
 
     def run(self, worker: Worker) -> Foreseen:
         """Play and compare: right is what ends with every block carried by what it was foreseen to be carried by."""
         env = worker.environment(self.scene)
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         base, rng = cast(TabletopEnv, env.unwrapped), np.random.default_rng([self.seed, self.scene.seed])
-        model, task = cast(Foresees, worker.world_model), cast(Rearrange, base.task)
+        model = cast(Foresees, worker.world_model if self.load is None else worker.model(self.load))
+        task = cast(Rearrange, base.task)
         right: dict[str, list[bool]] = {case: [] for case in CASES}
         for _ in range(SENTENCES):
             pairs = task.sentences(base.scene.objects, "seen")
@@ -245,7 +311,7 @@ class Foresight:
             taken = any(at == pair.target and one != pair.thing for one, at in enumerate(before))
             case = CASES[2 * covered + taken]
             right[case].append(foreseen == true)
-        return Foreseen(right)
+        return Foreseen(self.method, right)
 
 
 @dataclass(frozen=True)
@@ -302,27 +368,20 @@ def family_scene(family: str, number: int) -> StudyScene:
 
 def units(run: Run) -> dict[str, Part]:
     """Every episode, family by family, and the sentences that are foreseen."""
-    if cast(WorldModel, run.world_model).model.outcome is None:
-        raise UsageError(
-            f"{run.args.checkpoint} cannot foresee outcomes in one step, which this study is about"
-        )
     parts, seed = {}, run.args.seed
+    others = {key: LoadCheckpoint(name) for key, name in retrained(cast(Args, run.args).retrained).items()}
     for place, family in enumerate(FAMILIES):
         first = SCENES_PER_SEED * seed + FIRST + APART * place
         scenes = [family_scene(family, first + i) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
+        keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
         parts[family] = Part(
-            [
-                Episode(one.key, scene, seed)
-                for scene in scenes
-                for one in asked
-                if one.pictures or family != "picture"
-            ],
-            0.7,
+            [Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7
         )
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
     scenes = [family_scene(names[i % len(names)], first + i) for i in range(run.sizes.outcomes)]
-    parts[OUTCOMES] = Part([Foresight(scene, seed) for scene in scenes], 0.6)
+    foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
+    parts[OUTCOMES] = Part(foreseen, 0.6)
     return {**parts, "clips": Part(seconds=2.0, count=run.sizes.clips)}
 
 
@@ -340,8 +399,8 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 
 def rows(run: Run, found: Found) -> list[Row]:
     """Success and sentences of every line and family; how often the end of a sentence was foreseen."""
-    made = []
-    for family, key in product(FAMILIES, [*LINES, *CURVE]):
+    made, others = [], retrained(cast(Args, run.args).retrained)
+    for family, key in product(FAMILIES, [*LINES, *CURVE, *others]):
         here = [one for one in found[family] if one.episode.method == key]
         if not here:
             continue
@@ -354,11 +413,42 @@ def rows(run: Run, found: Found) -> list[Row]:
             made.append(
                 rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here])
             )
-    for case in CASES:
-        scenes = [one.right[case] for one in found[OUTCOMES] if one.right[case]]
+    for case, key in product(CASES, (OURS, *others)):
+        scenes = [one.right[case] for one in found[OUTCOMES] if one.method == key and one.right[case]]
         if scenes:
-            made.append(rate_row(OURS, "test", case, RIGHT, [float(np.mean(its)) for its in scenes]))
-    return made
+            made.append(rate_row(key, "test", case, RIGHT, [float(np.mean(its)) for its in scenes]))
+    known = by_key(made)
+    for place in [(family, SUCCESS) for family in FAMILIES] + [(case, RIGHT) for case in CASES]:
+        rates = [known[it].value for one in (OURS, *others) if (it := (one, "test", *place)) in known]
+        if others and len(rates) == 1 + len(others):
+            # Not an interval of scenes: the lowest and the highest seed.
+            made.append(Row(SEEDS, "test", *place, fmean(rates), min(rates), max(rates), len(rates)))
+    return [*made, mean_row(OURS, "test", f"{TIMED} sentences", "milliseconds", run.prepared)]
+
+
+def milliseconds(run: Run) -> list[float]:
+    """How long it takes to foresee where sentences lead, and to read the places of all things off the ends.
+
+    UsageError if the model cannot do it.
+    """
+    if cast(WorldModel, run.world_model).model.outcome is None:
+        raise UsageError(
+            f"{run.args.checkpoint} cannot foresee outcomes in one step, which this study is about"
+        )
+    scene = family_scene("plain", FIRST)
+    env, model = scene.make(), cast(Foresees, run.world_model)
+    observation, info = env.reset(seed=scene.seed, options=dict(scene.options))
+    goal, grounder = goal_of(observation, info), AppearanceGrounder.from_info(info)
+    parsed, grounding = observe(model, observation["rgb"], goal, grounder)
+    sentences = [one.text for one in grounding.instructions()]
+    said = (sentences * TIMED)[:TIMED]
+    taken = []
+    for _ in range(TIMES + 1):
+        began = perf_counter()
+        places(model.outcome(parsed, said), grounding, sorted(grounding.things))
+        taken.append(1000 * (perf_counter() - began))
+    env.close()
+    return taken[1:]  # the first warms up
 
 
 HEADLINE: dict[str, Key] = {
@@ -368,6 +458,7 @@ HEADLINE: dict[str, Key] = {
     if (key, family) != ("no imagination", "picture")
 }
 HEADLINE |= {f"outcome_{case}": (OURS, "test", case, RIGHT) for case in CASES[:3]}
+HEADLINE["milliseconds_30_sentences"] = OURS, "test", f"{TIMED} sentences", "milliseconds"
 
 
 # --- tables and page --------------------------------------------------------------------------------------------------
@@ -389,6 +480,12 @@ DETAILS = TableSpec(
         )
     ],
 )
+OVER_SEEDS = [
+    TableSpec(
+        f"{spec.title}, over training seeds", spec.columns, [Line(key=SEEDS, note="mean, lowest, highest")]
+    )
+    for spec in (GOALS, ENDS)
+]
 BUDGET = TableSpec(
     "Goal reached, by budget",
     columns(SUCCESS, {family: COLUMNS[family] for family in CURVE_FAMILIES}),
@@ -404,22 +501,6 @@ def seconds(found: Found) -> dict[str, dict[str, float]]:
         if its:
             table.setdefault(key, {})[family] = round(float(np.mean(its)), 3)
     return table
-
-
-def episodes(found: Found) -> list[dict[str, Any]]:
-    """One line an episode, from which the success rates can be computed again."""
-    return [
-        {
-            "method": one.episode.method,
-            "family": family,
-            "seed": one.episode.scene.seed,
-            "success": one.success,
-            "said": list(one.said),
-            "error": one.error,
-        }
-        for family in FAMILIES
-        for one in found[family]
-    ]
 
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
@@ -440,6 +521,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "its target. Occupied: something is at the target. Covered: something is on the block.",
             [ENDS.table(figures), DETAILS.table(figures)],
         ),
+        *_over_seeds(run, figures),
         Section(
             "How much search it takes",
             "The same planner, with fewer sentences to imagine for each plan.",
@@ -454,8 +536,19 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     ]
 
 
+def _over_seeds(run: Run, figures: Sequence[Row]) -> list[Section]:
+    if not cast(Args, run.args).retrained:
+        return []
+    text = "Beside the model above others of the same recipe, whose predictors were trained with other seeds."
+    return [Section("Other training seeds", text, [spec.table(figures) for spec in OVER_SEEDS])]
+
+
 STUDY = Study(
     name="imagination",
+    args=Args,
+    prepare=milliseconds,
+    inputs=lambda args: [Path(name) / WEIGHTS_FILE for name in args.retrained],
+    again="The same seed gives the same figures, but for the milliseconds.",
     title="Imagination",
     question="Does it help to foresee what a sentence leads to, where that is not what the sentence says?",
     sizes=lambda args: QUICK if args.quick else DEFAULT,
@@ -479,7 +572,6 @@ STUDY = Study(
     first=("plain", "occupied", "covered", "swap", "tower", "picture"),
     files=lambda run, found: {
         "timings.json": json.dumps(seconds(found), indent=2) + "\n",
-        "episodes.json": json.dumps(episodes(found), indent=1) + "\n",
     },
 )
 

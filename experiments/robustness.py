@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.plots import plot_table
-from experiments.report.results import Results
+from experiments.report.results import EpisodeLine, Results
 from experiments.report.rows import Key, Row, interval_row, mean_row, rate_row
 from experiments.report.tables import DASH, Cell, Column, Table, TableRow, TableSpec, as_percent, columns
 from experiments.study.clips import PredictionClip, best_and_worst, episode_clips, extreme_clips
@@ -33,7 +33,7 @@ from experiments.study.pictures import CHANGES, ChangedScene, change_rows, chang
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
-from experiments.study.scenes import StudyScene, study_scenes
+from experiments.study.scenes import StudyScene, place_of, scene_hash, study_scenes
 from planning import AppearanceGrounder
 from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
@@ -92,6 +92,14 @@ class RobustOutcome:
     curves: Mapping[str, Mapping[str, np.ndarray]]
     # method -> whether its masks show what the sentence says; methods that look 24 frames ahead
     success: Mapping[str, bool]
+    text: str = ""  # what was imagined
+
+    @property
+    def lines(self) -> list[EpisodeLine]:
+        """For `results.json`."""
+        scene = self.scene
+        where = place_of(scene), "predicted_success", scene_hash(scene), scene.seed, self.text
+        return [EpisodeLine(method, *where, float(good)) for method, good in self.success.items()]
 
     def figures(self) -> dict[Name, float]:
         """Means over the first frames after the observed one; and predicted success."""
@@ -130,7 +138,7 @@ class RobustScene:
             curves.setdefault(one.method, {})["iou"] = scores.iou[1:]
             if len(labels_THW) > HORIZON:
                 success[one.method] = judge_rollout(rollout, ground, truth.text)
-        return RobustOutcome(self.scene, curves, success)
+        return RobustOutcome(self.scene, curves, success, truth.text)
 
 
 def units(run: Run) -> dict[str, Part]:

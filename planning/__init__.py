@@ -60,6 +60,7 @@ from planning.search import (
     Foresees,
     LiteralPlanner,
     SearchPlanner,
+    Wanted,
     places,
     seen_supports,
 )
@@ -105,6 +106,7 @@ __all__ = [
     "Thing",
     "Thresholds",
     "Trace",
+    "Wanted",
     "WeightedSum",
     "ground",
     "ground_by_segmentation",

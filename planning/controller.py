@@ -71,10 +71,29 @@ class LiteralController:
         return PickAndPlace(*points)
 
     def _point(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> tuple[float, float]:
+        thing = self._top(rollout, grounding, thing)
         center = slot_center(rollout, grounding.slots_of(thing), 0)
         height = self._height(rollout, grounding, thing, center)
         x, y, _ = self.camera.unproject_to_plane(center, height)
         return float(x), float(y)
+
+    def _top(self, rollout: Rollout, grounding: Grounding, thing: Thing) -> Thing:
+        """The top of the pile that a block is in: it hides parts of those below, whose pixels then mislead."""
+        on, pile = RELATIONS["on"], [thing]
+        while thing.kind == on.kinds[1]:
+            below_it = torch.as_tensor(slot_center(rollout, grounding.slots_of(thing), 0))
+            off = {
+                other: float(on.distance_of_places(torch.as_tensor(center), below_it))
+                for other in grounding.of_kind(on.kinds[0])
+                if other not in pile
+                for center in [slot_center(rollout, grounding.slots_of(other), 0)]
+            }
+            above = min(off, key=off.__getitem__, default=thing)
+            if off.get(above, torch.inf) > on.within_px:
+                break
+            thing = above
+            pile.append(thing)
+        return thing
 
     def _height(
         self, rollout: Rollout, grounding: Grounding, thing: Thing, center: NDArray[np.float64]

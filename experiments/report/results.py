@@ -24,6 +24,21 @@ class Checkpoint:
 
 
 @dataclass(frozen=True)
+class EpisodeLine:
+    """What came of one method in one scene. The success rates of the rows are the means of these."""
+
+    method: str  # as in the rows
+    place: str  # the split of its scene, and which of the scene's sentences it was
+    metric: str  # as in the rows
+    scene: str  # hash of its line in `scenes.json`, see `scene_hash`
+    seed: int  # of the environment
+    goal: str  # in words
+    success: float  # 0 or 1; of several repeats the mean
+    said: Sequence[str] = ()  # the sentences that were carried out, in order
+    error: str | None = None  # why the robot gave up
+
+
+@dataclass(frozen=True)
 class Results:
     """A whole `results.json`."""
 
@@ -37,6 +52,7 @@ class Results:
     rows: Sequence[Row]  # the figures
     # the few figures that a reader wants first, name -> number
     headline: Mapping[str, float] = field(default_factory=dict)
+    episodes: Sequence[EpisodeLine] = ()  # what the success rates were computed from
 
     def __post_init__(self) -> None:
         for name, number in self.headline.items():
@@ -52,8 +68,12 @@ class Results:
         return None
 
     def to_json(self) -> str:
-        """The text of `results.json`: stable order of keys, no NaN."""
-        return json.dumps(asdict(self), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        """The text of `results.json`: stable order of keys, no NaN, a line for each episode."""
+        data = asdict(self)
+        lines = [json.dumps(one, allow_nan=False, ensure_ascii=False) for one in data.pop("episodes")]
+        head = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False)
+        listed = "".join(f"{',' * bool(i)}\n    {line}" for i, line in enumerate(lines))
+        return f'{head[:-2]},\n  "episodes": [{listed}\n  ]\n}}\n'
 
     @classmethod
     def from_json(cls, text: str) -> Results:
@@ -69,8 +89,12 @@ class Results:
             raise ValueError("results.rows must be a list")
         for row in data["rows"]:
             _check_names("row", row, Row)
+        for line in data["episodes"]:
+            _check_names("episode", line, EpisodeLine)
         rows = [Row(**row) for row in data["rows"]]
-        return cls(**{**data, "checkpoint": Checkpoint(**data["checkpoint"]), "rows": rows})
+        lines = tuple(EpisodeLine(**{**line, "said": tuple(line["said"])}) for line in data["episodes"])
+        checkpoint = Checkpoint(**data["checkpoint"])
+        return cls(**{**data, "checkpoint": checkpoint, "rows": rows, "episodes": lines})
 
     @classmethod
     def read(cls, path: str | Path) -> Results:

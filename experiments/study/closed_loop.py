@@ -9,9 +9,10 @@ from statistics import fmean
 
 import numpy as np
 
+from experiments.report.results import EpisodeLine
 from experiments.study.methods import METHODS, Method
 from experiments.study.pool import Worker
-from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene
+from experiments.study.scenes import SampledScene, StudyScene, place_of, play_expert, sample_scene, scene_hash
 from planning import AppearanceGrounder, EpisodeResult, Goal, SegmentationGrounder, run_episode
 from textocvp.protocols import LoadModel
 
@@ -36,6 +37,25 @@ class LoopOutcome:
     def steps(self) -> int:
         """Pick-and-places carried out."""
         return len(self.instructions)
+
+    @property
+    def lines(self) -> list[EpisodeLine]:
+        """For `results.json`."""
+        of, scene = self.episode, self.episode.scene
+        who = of.method if of.load is None else f"{of.method}, {of.load}"
+        return [
+            EpisodeLine(
+                who,
+                place_of(scene, of.variant),
+                "closed_loop_success",
+                scene_hash(scene),
+                scene.seed,
+                self.text,
+                float(self.success),
+                self.instructions,
+                self.error,
+            )
+        ]
 
 
 @dataclass(frozen=True)

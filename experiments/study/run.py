@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import os
 import shlex
 import sys
@@ -12,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -29,6 +28,7 @@ from experiments.study.frame_metrics import Measures
 from experiments.study.kept import KeptWork, file_digest, identity_of
 from experiments.study.methods import METHODS, find_models
 from experiments.study.pool import Pool, Unit, available_cores
+from experiments.study.scenes import scene_line
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel, SlotModel
 
@@ -127,7 +127,7 @@ class Part:
 
 
 Found = Mapping[str, list[Any]]
-"""The results of the finished units of each part, in their order."""
+"""The results of the finished units of each part, in their order. Those with `lines` tell of single episodes."""
 
 
 @dataclass(frozen=True)
@@ -308,9 +308,16 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
         versions = {**package_versions(), **hashes, **study.versions(this)}
         if manifest:
             versions["scenes.json"] = hashlib.sha256(manifest.encode()).hexdigest()
-        seconds = round(time.monotonic() - began, 1)
         results = Results(
-            study.name, this.checkpoint, versions, seeds, this.args.quick, seconds, rows, this.headline(rows)
+            study.name,
+            this.checkpoint,
+            versions,
+            seeds,
+            this.args.quick,
+            round(time.monotonic() - began, 1),
+            rows,
+            this.headline(rows),
+            [line for part in found.values() for one in part for line in getattr(one, "lines", ())],
         )
         _write(this, results, found, manifest)
         done = True
@@ -358,7 +365,7 @@ def _write(this: Run, results: Results, found: Found, manifest: str) -> None:
 def scenes_manifest(units: Sequence[Unit[Any]]) -> str:
     """Every scene of some units, once, a line each: with it the environments build the same scenes again."""
     scenes = chain.from_iterable(map(_scenes_of, units))
-    lines = dict.fromkeys(json.dumps(asdict(scene), default=str) for scene in scenes)
+    lines = dict.fromkeys(map(scene_line, scenes))
     return "[\n" + ",\n".join(sorted(lines)) + "\n]\n" if lines else ""
 
 

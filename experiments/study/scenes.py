@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -38,6 +40,21 @@ class StudyScene:
             options["n_pairs"] = self.steps
         name = self.env_id or ("PutBlockInBowl-v0" if self.steps == 1 else "PutBlocksInBowls-v0")
         return gym.make(name, control="primitive", record_frames=True, **options)
+
+
+def scene_line(scene: Any) -> str:
+    """A scene in a line of `scenes.json`."""
+    return json.dumps(asdict(scene), default=str)
+
+
+def scene_hash(scene: Any) -> str:
+    """12 hexadecimal digits that name a scene: of the SHA-256 of its line."""
+    return hashlib.sha256(scene_line(scene).encode()).hexdigest()[:12]
+
+
+def place_of(scene: StudyScene, variant: int = 0) -> str:
+    """Where an episode counts: `place` of `EpisodeLine`."""
+    return f"{scene.split}, {f'variant {variant}' if variant else 'original'}"
 
 
 def study_scenes(

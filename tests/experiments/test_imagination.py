@@ -1,27 +1,32 @@
 """Imagination: what is measured, with the shipped model in a few scenes."""
 
+import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import textocvp
 from envs.tasks.rearrange import FAMILIES
 from experiments.imagination import (
     ATTEMPTS,
     CASES,
     LINES,
     OURS,
+    SEEDS,
     STUDY,
+    Args,
     Episode,
     Foresight,
     Sizes,
+    TrueSlotsPlanner,
     family_scene,
     goal_of,
 )
 from experiments.study.pool import Worker
-from experiments.study.run import StudyArgs, UsageError, run
-from planning import Goal, PictureGoal
+from experiments.study.run import UsageError, run
+from planning import Goal, PictureGoal, SegmentationGrounder, Thing, places
 from textocvp import WorldModel
 
 
@@ -31,19 +36,24 @@ def worker() -> Worker:
 
 
 def test_a_whole_study(tmp_path: Path) -> None:
-    args = StudyArgs(out=tmp_path, quick=True, workers=1)
+    other = str(Path(textocvp.__file__).parent / "checkpoints/tabletop-small")
+    args = Args(out=tmp_path, quick=True, workers=1, retrained=(other, other))
     run(STUDY, args, sizes=Sizes(scenes=1, outcomes=6, clips=2))
     data = json.loads((tmp_path / "results.json").read_text())
     assert data["headline"]["occupied_simulator"] == data["headline"]["plain"] == 1.0
     assert data["headline"]["occupied_no_imagination"] == data["headline"]["occupied_believes"] == 0.0
     assert {f"outcome_{case}" for case in CASES[:3]} <= set(data["headline"])
-    lines = json.loads((tmp_path / "episodes.json").read_text())
+    hashes = {hashlib.sha256(line.strip(",").encode()).hexdigest()[:12]
+              for line in (tmp_path / "scenes.json").read_text().splitlines()[1:-1]}  # fmt: skip
     again = {}
-    for line in lines:
-        again.setdefault((line["method"], line["family"]), []).append(line["success"])
+    for line in data["episodes"]:
+        assert line["scene"] in hashes
+        again.setdefault((line["method"], line["place"]), []).append(line["success"])
     for row in data["rows"]:
         if row["metric"] == "closed_loop_success" and row["method"] in LINES:
             assert row["value"] == np.mean(again[row["method"], row["variant"]])
+    seeds = [(row["variant"], row["n"]) for row in data["rows"] if row["method"] == SEEDS]
+    assert ("tower", 3) in seeds and len(seeds) >= len(FAMILIES) + 3
     page = (tmp_path / "report.html").read_text()
     assert "Goals that need foresight" in page and (tmp_path / "clips/imagination-1.gif").exists()
 
@@ -79,6 +89,20 @@ def test_foresight_is_judged_by_what_the_simulator_says(worker: Worker) -> None:
     assert np.mean(found[0]) > 0.7 > 0.5 > np.mean(found[1])
 
 
+def test_true_slots_are_where_the_simulator_sees_them(worker: Worker) -> None:
+    scene = family_scene("plain", 5_001)
+    observation, info = worker.environment(scene).reset(seed=scene.seed, options=dict(scene.options))
+    planner, grounder = TrueSlotsPlanner(worker.world_model), SegmentationGrounder.from_info(info)
+    parsed, grounding, _ = planner.look(observation["rgb"], goal_of(observation, info), grounder)
+    things = sorted(grounding.things)
+    for at_2, thing in zip(places(parsed, grounding, things)[0].numpy(), things, strict=True):
+        label = next(one["label"] for one in info["objects"] if Thing(one["color"], one["kind"]) == thing)
+        y, x = np.nonzero(info["segmentation"] == label)
+        np.testing.assert_allclose(at_2, (x.mean() + 0.5, y.mean() + 0.5), atol=1e-3)
+
+
 def test_a_model_without_foresight_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no model\.safetensors"):
+        Args(retrained=(str(tmp_path),))
     with pytest.raises(UsageError, match="cannot foresee outcomes"):
-        run(STUDY, StudyArgs(checkpoint="ocvp-seq-small", out=tmp_path, quick=True, workers=1))
+        run(STUDY, Args(checkpoint="ocvp-seq-small", out=tmp_path, quick=True, workers=1))

@@ -9,7 +9,18 @@ from tests.experiments import examples
 
 def test_the_file_has_exactly_the_agreed_fields() -> None:
     data = json.loads(examples.results().to_json())
-    assert list(data) == ["study", "checkpoint", "versions", "seeds", "quick", "seconds", "rows", "headline"]
+    assert list(data) == [
+        "study",
+        "checkpoint",
+        "versions",
+        "seeds",
+        "quick",
+        "seconds",
+        "rows",
+        "headline",
+        "episodes",
+    ]
+    assert set(data["episodes"][0]) >= {"method", "place", "scene", "success", "said", "error"}
     assert set(data["checkpoint"]) == {"name", "sha256"}
     assert set(data["rows"][0]) == {"method", "split", "variant", "metric", "value", "low", "high", "n"}
     assert data["headline"] == {"predicted_original": 0.9}
