@@ -1,0 +1,482 @@
+"""What one open page plays with: a scene in its own simulator, and the model that all pages share."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, cast
+from urllib.parse import parse_qsl, urlencode
+
+import gymnasium as gym
+import numpy as np
+
+import envs
+from envs.colors import COLORS
+from envs.tabletop import TabletopEnv
+from planning import (
+    RELATIONS,
+    AppearanceGrounder,
+    Goal,
+    Grounding,
+    Instruction,
+    LiteralController,
+    PictureGoal,
+    PinholeCamera,
+    SearchPlanner,
+    Thing,
+    places,
+    seen_supports,
+)
+from planning.controller import RESTING_HEIGHTS
+from planning.search import HORIZON
+from textocvp import Rollout, WorldModel
+from textocvp.film_page import film_data, picture_url
+from textocvp.pictures import read_picture
+
+MOST_SENTENCES = 12  # side by side
+BRANCHES = 12  # sequences of sentences that the tree of a plan shows
+MOST_ACTS = 100  # pick-and-places that a link repeats
+
+
+class Refused(Exception):
+    """What a person asked for and cannot have; the sentence is shown in the page."""
+
+
+@dataclass(frozen=True)
+class World:
+    """An environment to play in, and the checkpoint that knows it."""
+
+    env_id: str
+    checkpoint: str
+    options: Mapping[str, Any]
+
+    def make(self, image_size: int) -> gym.Env[Any, Any]:
+        """The environment, which acts by pick-and-place and keeps all frames."""
+        made = dict(control="primitive", record_frames=True, image_size=image_size, max_steps=10**6)
+        return gym.make(self.env_id, **made, **self.options)
+
+
+WORLDS = {
+    "tabletop": World("PutBlockInBowl-v0", "tabletop-small", {}),
+    "rearrange": World("RearrangeBlocks-v0", "tabletop-small", {}),
+    "cliport": World("PutBlockInBowl-v0", "cliport", {"scene": "cliport"}),
+}
+assert set(envs.TASKS), "importing envs registers the environments"
+
+_heard = threading.local()
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """The warnings of this thread, as sentences. `warnings.catch_warnings` would take those of other threads, too."""
+    if warnings.showwarning is not _keep:
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = _keep
+    _heard.sentences = []
+    try:
+        yield _heard.sentences
+    finally:
+        del _heard.sentences
+
+
+def _keep(message: Warning | str, *_: Any, **__: Any) -> None:
+    if hasattr(_heard, "sentences"):
+        _heard.sentences.append(str(message))
+
+
+@dataclass(frozen=True)
+class Link:
+    """All that makes a scene: what the query string of a link says."""
+
+    seed: int = 0
+    family: str = ""  # of a random scene of the world "rearrange"
+    layout: tuple[tuple[str, str, float, float, float, float], ...] = ()  # kind, colour, x, y, z and yaw
+    acts: tuple[tuple[float, ...], ...] = ()  # pick-and-places since then
+
+    def query(self) -> str:
+        """As a query string."""
+        said = {"seed": str(self.seed), "family": self.family}
+        said |= {"layout": ";".join(",".join(map(str, item)) for item in self.layout)}
+        said |= {"acts": ";".join(",".join(map(str, act)) for act in self.acts)}
+        return urlencode({name: value for name, value in said.items() if value}, safe=",;")
+
+    @classmethod
+    def parse(cls, query: str) -> Link:
+        """The inverse of `query`; what else the link says is left alone. Refused for what is no link."""
+        said = dict(parse_qsl(query.removeprefix("?")))
+        try:
+            items = [item.split(",") for item in said.get("layout", "").split(";") if item]
+            layout = tuple((kind, color, *map(float, rest)) for kind, color, *rest in items)
+            acts = tuple(tuple(map(float, act.split(","))) for act in said.get("acts", "").split(";") if act)
+        except ValueError:
+            layout, acts = ((),), ()
+        if not (all(len(item) == 6 for item in layout) and all(len(act) == 4 for act in acts)):
+            raise Refused("the link is damaged: its layout or its acts cannot be read")
+        if len(acts) > MOST_ACTS:
+            raise Refused(f"the link repeats {len(acts)} acts; at most {MOST_ACTS} are")
+        return cls(read_seed(said.get("seed", "0")), said.get("family", ""), cast(Any, layout), acts)
+
+
+def read_seed(text: str) -> int:
+    """A seed as a person types it."""
+    text = text.strip()
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise Refused(f"the seed must be a whole number of at least 0 and less than 20 digits, not {text!r}")
+    return int(text)
+
+
+class Session:
+    """One page's scene. Its methods are called by one thread at a time; `lock` sees to that.
+
+    Raises:
+        Refused, ValueError, GroundingError: from every method that takes wishes, with a sentence for the page.
+    """
+
+    def __init__(self, world_model: WorldModel, world: World, link: Link, horizon: int = HORIZON) -> None:
+        self.world_model, self.world = world_model, world
+        self.horizon = min(horizon, world_model.longest_horizon or horizon)
+        self.lock = threading.Lock()
+        self.env = world.make(world_model.image_size[0])
+        self.base = cast(TabletopEnv, self.env.unwrapped)
+        self.link = Link()
+        self.picture: np.ndarray | None = None  # a person's own, instead of the scene
+        self.goal: Goal | PictureGoal | None = None
+        self.before_goal: Link | None = None  # the scene, while the goal is arranged
+        self.last: tuple[Rollout, np.ndarray | None] | None = None  # what may be downloaded
+        try:
+            self.show(link)
+        except BaseException:
+            self.env.close()
+            raise
+
+    def close(self) -> None:
+        """Give the simulator back."""
+        self.env.close()
+
+    # -- the scene ---------------------------------------------------------------------------------------------
+
+    def show(self, link: Link) -> None:
+        """Build the scene of a link; a scene that cannot be is refused and the last one stays."""
+        options: dict[str, Any] = {"family": link.family} if link.family else {}
+        if link.family and not self.base.task.stacks:
+            raise Refused(f"this world has no families of scenes, such as {link.family!r}")
+        if link.layout:
+            options = {"layout": [_as_item(item) for item in link.layout]}
+        observation, info = self.env.reset(seed=link.seed, options=options)
+        for act in link.acts:
+            observation, *_, info = self.env.step(self._within_reach(act))
+        self.link, self.rgb, self.info, self.picture = link, observation["rgb"], info, None
+
+    def _within_reach(self, act: Sequence[float]) -> np.ndarray:
+        space = cast(gym.spaces.Box, self.env.action_space)
+        return np.clip(np.asarray(act, np.float32), space.low, space.high)
+
+    def view(self) -> dict[str, Any]:
+        """The scene as the page shows it."""
+        seen = self.rgb if self.picture is None else self.picture
+        return {
+            "picture": picture_url(seen),
+            "size": [seen.shape[1], seen.shape[0]],
+            "own_picture": self.picture is not None,
+            "link": self.link.query(),
+            "seed": str(self.link.seed),
+            "family": self.link.family,
+            "task": self.info["instruction"],
+            "sentences": self.sentences(),
+            "things": [] if self.picture is not None else self._things(),
+            "arranging": self.before_goal is not None,
+        }
+
+    def _things(self) -> list[dict[str, Any]]:
+        camera, colors = PinholeCamera.from_info(self.info["camera"]), self.info["palette"]["colors"]
+        return [
+            {
+                "id": number,
+                "name": f"{item['color']} {item['kind']}",
+                "color": [int(value) for value in colors[item["color"]]],
+                "at": camera.project(item["position"]).tolist(),
+            }
+            for number, item in enumerate(self.info["objects"])
+        ]
+
+    def sentences(self) -> list[str]:
+        """Every sentence of one step about what is there; of a person's own picture about what is seen."""
+        if self.picture is None:
+            named = {Thing(item["color"], item["kind"]): () for item in self.info["objects"]}
+            grounding = Grounding((), (), named)
+        else:
+            grounding = self._grounder(self.world_model.parse(self.picture[None]))
+        relations = [one.name for one in self.base.task.relations if one.name in RELATIONS]
+        return [one.text for one in grounding.instructions(*relations)]
+
+    @property
+    def _grounder(self) -> AppearanceGrounder:
+        return AppearanceGrounder.from_info(self.info)
+
+    def _layout(self) -> list[list[Any]]:
+        """What is there now; numbers are rounded as links have them."""
+        rows = []
+        for item in self.info["objects"]:
+            qx, qy, qz, qw = map(float, item["orientation"])
+            yaw = float(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
+            numbers = [round(float(value), 4) for value in (*item["position"], yaw)]
+            rows.append([item["kind"], item["color"], *numbers])
+        return rows
+
+    def _on_table(self, kind: str, x: float, y: float, others: Sequence[Sequence[Any]]) -> list[float]:
+        """Where a thing comes to stand that is put down at a pixel: on the block there, if blocks may be stacked."""
+        camera = PinholeCamera.from_info(self.info["camera"])
+        place = camera.unproject_to_plane((x, y), RESTING_HEIGHTS[kind])
+        side = self.base.setup.sizes.block
+        under = [
+            other[4]
+            for other in others
+            if (kind, other[0]) == ("block", "block") and np.hypot(*(place[:2] - other[2:4])) < side / 2
+        ]
+        height = max(under) + side if under and self.base.task.stacks else side / 2
+        return [*(round(float(value), 4) for value in (*place[:2], height))]
+
+    def _rearrange(self, rows: Sequence[Sequence[Any]]) -> None:
+        if self.picture is not None:
+            raise Refused(
+                "this is your own picture: nothing in it can be moved; go back to the scene for that"
+            )
+        self.show(Link(self.link.seed, "", tuple(tuple(row) for row in rows)))
+
+    def move(self, thing: int, x: float, y: float) -> None:
+        """Put a thing down at a pixel."""
+        rows = self._layout()
+        self._check(thing)
+        others = [row for number, row in enumerate(rows) if number != thing]
+        rows[thing][2:5] = self._on_table(rows[thing][0], x, y, others)
+        self._rearrange(rows)
+
+    def remove(self, thing: int) -> None:
+        """Take a thing away."""
+        self._check(thing)
+        self._rearrange([row for number, row in enumerate(self._layout()) if number != thing])
+
+    def add(self, kind: str, color: str) -> None:
+        """Add a thing at the first free place."""
+        if kind not in RESTING_HEIGHTS or color not in COLORS:
+            raise Refused(f"there are blocks and bowls in {', '.join(COLORS)}, but no {color} {kind}")
+        rows, problem = self._layout(), "there is no room for it"
+        for x in np.linspace(*self.base.setup.spawn.x, 8):
+            for y in np.linspace(*self.base.setup.spawn.y, 8):
+                new = [kind, color, round(float(x), 4), round(float(y), 4), 0.03, 0.0]
+                try:
+                    return self._rearrange([*rows, new])
+                except ValueError as error:
+                    problem = str(error)
+        raise Refused(f"no {color} {kind} can be added: {problem}")
+
+    def _check(self, thing: int) -> None:
+        if not 0 <= thing < len(self.info["objects"]):
+            raise Refused(f"there is no thing number {thing}")
+
+    def upload(self, data: bytes, crop: bool = False) -> list[str]:
+        """Take a picture file instead of the scene; what was done to it."""
+        try:
+            picture, done = read_picture(BytesIO(data), self.world_model.image_size, resize=True, crop=crop)
+        except (OSError, ValueError) as error:  # what no picture can be read from is an OSError, too
+            raise Refused(f"this is no picture that can be read: {error}") from None
+        except Exception as error:  # a picture of too many pixels, or one damaged in a way of its own
+            raise Refused(f"this picture cannot be taken: {error}") from None
+        self.picture = picture
+        self.world_model.parse(picture[None])  # which warns of a foreign picture
+        return done
+
+    # -- imagining and doing -----------------------------------------------------------------------------------
+
+    def imagine(self, texts: Sequence[str]) -> list[dict[str, Any]]:
+        """One film a sentence."""
+        if not 1 <= len(texts) <= MOST_SENTENCES:
+            raise Refused(f"give 1 to {MOST_SENTENCES} sentences, not {len(texts)}")
+        rollout = self._imagined(texts)
+        self.last = rollout, None
+        return self.films(rollout)
+
+    def _imagined(self, texts: Sequence[str]) -> Rollout:
+        seen = self.rgb if self.picture is None else self.picture
+        return self.world_model.rollout(seen, list(texts), horizon=self.horizon, attention=True)
+
+    def films(self, rollout: Rollout, real: np.ndarray | None = None) -> list[dict[str, Any]]:
+        """Films with the names of their things."""
+        names = self._names(self._grounder(rollout.select(0)))
+        words = [self.world_model.words(text) for text in rollout.texts]
+        return [film_data(rollout, words[row], names, row=row, real=real) for row in range(len(rollout))]
+
+    def do(self, text: str) -> dict[str, Any]:
+        """Carry a sentence out: the imagined film beside what happened, and whether the goal is reached."""
+        if self.picture is not None:
+            raise Refused("this is your own picture, with no robot behind it; go back to the scene to act")
+        if len(self.link.acts) >= MOST_ACTS:
+            raise Refused(f"{MOST_ACTS} acts were carried out in this scene; take a new one")
+        instruction = self._read(text)
+        rollout = self._imagined([text])
+        grounding = self._grounder(rollout.select(0)).with_kinds(instruction.things)
+        camera = PinholeCamera.from_info(self.info["camera"])
+        action = LiteralController(camera).act(rollout, grounding, instruction).to_action()
+        act = tuple(round(float(value), 4) for value in action)  # as a link repeats it
+        film_THW3 = [self.rgb]
+        observation, *_, self.info = self.env.step(self._within_reach(act))
+        film_THW3 += list(self.info["frames"])
+        self.rgb = observation["rgb"]
+        self.link = Link(self.link.seed, self.link.family, self.link.layout, (*self.link.acts, act))
+        real = np.stack(film_THW3)
+        self.last = rollout, real
+        return {"film": self.films(rollout, real)[0], **self.goal_state()}
+
+    def _read(self, text: str) -> Instruction:
+        """A sentence of any wording that the model understands."""
+        try:
+            return Instruction.parse(text)
+        except ValueError:
+            with suppress(ValueError):
+                return Instruction.parse(self.world_model.reads(text))
+            raise
+
+    # -- goals and plans ---------------------------------------------------------------------------------------
+
+    def arrange_goal(self, what: str) -> None:
+        """Begin to arrange the scene as it shall be; `use` that as the goal, or `cancel`: both bring the scene back."""
+        if what == "begin":
+            if self.picture is not None:
+                raise Refused("this is your own picture; go back to the scene to arrange a goal")
+            self.before_goal = self.before_goal or self.link
+            return
+        if self.before_goal is None:
+            raise Refused("no goal is being arranged")
+        if what == "use":
+            self.goal, self.goal_supports = PictureGoal(self.rgb), tuple(self.info["supports"])
+        before, self.before_goal = self.before_goal, None
+        self.show(before)
+
+    def goal_state(self) -> dict[str, Any]:
+        """Whether the goal is seen to be reached, and whether the simulator says so; nothing without a goal."""
+        if self.goal is None:
+            return {}
+        ids = {(item["color"], item["kind"]): number for number, item in enumerate(self.info["objects"])}
+        supports = list(self.info["supports"])
+        if isinstance(self.goal, PictureGoal):
+            true = supports == list(self.goal_supports)
+        else:
+            ends = [
+                [ids.get((one.color, one.kind)) for one in asked.things] for asked in self.goal.instructions
+            ]
+            true = all(None not in pair and supports[cast(int, pair[0])] == pair[1] for pair in ends)
+        return {"reached": {"seen": self._planner.reached(self.rgb, self.goal, self._grounder), "true": true}}
+
+    @property
+    def _planner(self) -> SearchPlanner:
+        return SearchPlanner(self.world_model)
+
+    def plan(self, text: str) -> dict[str, Any]:
+        """Search for the goal of a sentence, or for the one that was arranged where there is no sentence."""
+        if self.picture is not None or self.before_goal is not None:
+            raise Refused("plans are made for the scene: go back to it first")
+        if text.strip():
+            self.goal = Goal.parse(text)
+        if self.goal is None:
+            raise Refused("say what the goal is, or arrange it")
+        if self.world_model.model.outcome is None:
+            raise Refused(
+                f"the checkpoint {self.world_model.checkpoint.name} cannot foresee where sentences lead, which a "
+                "plan is made of; tabletop-small can"
+            )
+        state = self.goal_state()
+        if state["reached"]["seen"]:
+            return {"goal": self._goal_data(), "done": True, **state}
+        plan = self._planner.plan(self.rgb, self.goal, self._grounder)
+        films = [film_data(one, (), self._names(plan.grounding)) for one in plan.rollouts]
+        shown = [one.instructions for one in plan.ranking[:BRANCHES]]
+        reaching = {one.instructions for one in plan.ranking if one.reaches_goal}
+        scores = {one.instructions: round(-one.score, 1) for one in plan.ranking}
+        ends = self._ends(shown)
+        best = plan.best.instructions
+        nodes = [
+            {
+                "text": path[-1].text,
+                "depth": len(path),
+                "picture": picture_url(frame),
+                "away": scores.get(path),
+                "reaches": path in reaching,
+                "chosen": path == best[: len(path)],
+            }
+            for path, (frame, _) in sorted(ends.items(), key=lambda one: _order(one[0], shown))
+        ]
+        return {
+            "goal": self._goal_data(),
+            "done": False,
+            "sentences": [one.text for one in best],
+            "reaches": plan.best.reaches_goal,
+            "seconds": round(plan.seconds, 1),
+            "tree": nodes,
+            "films": films,
+            "obvious": self._obvious(plan.grounding),
+        }
+
+    def _names(self, grounding: Grounding) -> dict[int, str]:
+        things = {slot: str(thing) for thing, slots in grounding.things.items() for slot in slots}
+        return things | {slot: "arm" for slot in grounding.arm}
+
+    def _goal_data(self) -> dict[str, Any]:
+        if isinstance(self.goal, PictureGoal):
+            return {"picture": picture_url(self.goal.rgb)}
+        return {"text": " and ".join(one.text for one in cast(Goal, self.goal).instructions)}
+
+    def _ends(self, paths: Sequence[Path]) -> dict[Path, tuple[np.ndarray, Rollout]]:
+        """Where sequences of sentences, and all their beginnings, are imagined to lead: a picture and the slots."""
+        level: dict[Path, Rollout] = {(): self.world_model.parse(self.rgb[None])}
+        ends: dict[Path, tuple[np.ndarray, Rollout]] = {}
+        for depth in range(1, 1 + max(map(len, paths))):
+            wanted = list(dict.fromkeys(path[:depth] for path in paths if len(path) >= depth))
+            imagined: dict[Path, Rollout] = {}
+            for before, start in level.items():
+                after = [path for path in wanted if path[:-1] == before]
+                if after:
+                    batch = self.world_model.outcome(start, [path[-1].text for path in after])
+                    imagined |= {path: batch.select(row).last for row, path in enumerate(after)}
+            for path, one in imagined.items():
+                frame_3HW = one.decode_frames([0])[0, 0]
+                ends[path] = (frame_3HW.permute(1, 2, 0).mul(255).round().byte().cpu().numpy(), one)
+            level = imagined
+        return ends
+
+    def _obvious(self, grounding: Grounding) -> dict[str, Any] | None:
+        """The goal's own sentences, one after another: where they are imagined to lead, and what is wrong with that."""
+        if isinstance(self.goal, PictureGoal) or self.goal is None:
+            return None
+        asked, things = self.goal.instructions, sorted(grounding.things)
+        frame, end = self._ends([asked])[asked]
+        carriers = seen_supports(places(end, grounding, things), things)[0]
+        wrong = [
+            f"the {one.thing} is imagined to end {_where(carriers[one.thing])}, not {one.relation} the {one.target}"
+            for one in asked
+            if carriers.get(one.thing) != one.target
+        ]
+        return {"sentences": [one.text for one in asked], "picture": picture_url(frame), "wrong": wrong}
+
+
+Path = tuple[Instruction, ...]
+
+
+def _order(path: Path, shown: Sequence[Path]) -> tuple[int, ...]:
+    """So that a tree is written from its root, best branches first."""
+    return tuple(
+        min(n for n, one in enumerate(shown) if one[:k] == path[:k]) for k in range(1, len(path) + 1)
+    )
+
+
+def _where(carrier: Thing | None) -> str:
+    return "on the table" if carrier is None else f"{'in' if carrier.kind == 'bowl' else 'on'} the {carrier}"
+
+
+def _as_item(item: Sequence[Any]) -> dict[str, Any]:
+    kind, color, x, y, z, yaw = item
+    turned = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+    return {"kind": kind, "color": color, "position": (x, y, z), "orientation": turned}
