@@ -80,7 +80,7 @@ function filmCard(film, title = film.text) {
 
   const drawn = [picture("imagined", film.frames)];
   const slots = panel("slots");
-  if (film.real) drawn.push(picture("what happened in PyBullet", film.real), picture("difference", film.apart));
+  if (film.real) drawn.push(picture("what happened", film.real), picture("difference", film.apart));
   const apart = drawn[2]?.below;
 
   function drawSlots(moment) {

@@ -20,6 +20,7 @@ from envs.tabletop import TabletopEnv
 from planning import (
     RELATIONS,
     AppearanceGrounder,
+    Foresees,
     Goal,
     Grounding,
     Instruction,
@@ -56,8 +57,8 @@ class World:
 
     def make(self, image_size: int) -> gym.Env[Any, Any]:
         """The environment, which acts by pick-and-place and keeps all frames."""
-        made = dict(control="primitive", record_frames=True, image_size=image_size, max_steps=10**6)
-        return gym.make(self.env_id, **made, **self.options)
+        options = {"image_size": image_size, "max_steps": 10**6, **self.options}
+        return gym.make(self.env_id, control="primitive", record_frames=True, **cast(Any, options))
 
 
 WORLDS = {
@@ -373,7 +374,7 @@ class Session:
 
     @property
     def _planner(self) -> SearchPlanner:
-        return SearchPlanner(self.world_model)
+        return SearchPlanner(cast(Foresees, self.world_model))
 
     def plan(self, text: str) -> dict[str, Any]:
         """Search for the goal of a sentence, or for the one that was arranged where there is no sentence."""
