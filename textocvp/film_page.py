@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def film_data(
         "frames": picture_url(frames_THW3.reshape(T * H, W, 3)),  # one below the other
         "runs": run_lengths(one.masks[0].argmax(1).cpu().numpy()),
         "colors": colors_K3.tolist(),
-        "slots": [{"slot": slot, "name": name} for slot, name in sorted(named.items())],
+        "slots": [{"slot": slot, "name": name} for slot, name in sorted(named.items(), key=itemgetter(1))],
     }
     if one.attention is not None and words:
         # Percent, the mean over layers and heads; frame 0 was seen, and shows the attention of the first step.

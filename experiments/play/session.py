@@ -228,18 +228,15 @@ class Session:
             rows.append([item["kind"], item["color"], *numbers])
         return rows
 
-    def _on_table(self, kind: str, x: float, y: float, others: Sequence[Sequence[Any]]) -> list[float]:
-        """Where a thing comes to stand that is put down at a pixel: on the block there, if blocks may be stacked."""
-        camera = PinholeCamera.from_info(self.info["camera"])
-        place = camera.unproject_to_plane((x, y), RESTING_HEIGHTS[kind])
-        side = self.base.setup.sizes.block
-        under = [
-            other[4]
-            for other in others
-            if (kind, other[0]) == ("block", "block") and np.hypot(*(place[:2] - other[2:4])) < side / 2
-        ]
-        height = max(under) + side if under and self.base.task.stacks else side / 2
-        return [*(round(float(value), 4) for value in (*place[:2], height))]
+    def _put_down(self, kind: str, x: float, y: float, others: Sequence[Sequence[Any]]) -> list[float]:
+        """Where a thing comes to stand that is let go at a pixel: a block over the middle of what is under it."""
+        camera, sizes = PinholeCamera.from_info(self.info["camera"]), self.base.setup.sizes
+        place, height = camera.unproject_to_plane((x, y), RESTING_HEIGHTS[kind])[:2], sizes.block / 2
+        reach = {"bowl": sizes.bowl_floor_radius, "block": sizes.block / 2 if self.base.task.stacks else 0.0}
+        for other, _, *its, z, _ in sorted(others, key=lambda row: row[4]) if kind == "block" else ():
+            if np.hypot(*(place - its)) < reach[other]:
+                place, height = np.array(its), (z + sizes.block if other == "block" else height)
+        return [round(float(value), 4) for value in (*place, height)]
 
     def _rearrange(self, rows: Sequence[Sequence[Any]]) -> None:
         if self.picture is not None:
@@ -253,7 +250,7 @@ class Session:
         rows = self._layout()
         self._check(thing)
         others = [row for number, row in enumerate(rows) if number != thing]
-        rows[thing][2:5] = self._on_table(rows[thing][0], x, y, others)
+        rows[thing][2:5] = self._put_down(rows[thing][0], x, y, others)
         self._rearrange(rows)
 
     def remove(self, thing: int) -> None:
