@@ -10,7 +10,6 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +45,28 @@ def film_data(
     frames_THW3 = (one.frames[0].permute(0, 2, 3, 1).cpu().numpy() * 255).round().astype(np.uint8)
     T, H, W, _ = frames_THW3.shape
     colors_K3 = (one.colors[0, 0].cpu().numpy() * 255).round().astype(int)
-    named = slot_names(one) if names is None else names
+    shown: dict[str, list[int]] = {}  # a thing may have several slots: all count as its first
+    for slot, name in sorted((slot_names(one) if names is None else names).items()):
+        shown.setdefault(name, []).append(slot)
+    first_K = np.arange(len(colors_K3))
+    for slots in shown.values():
+        first_K[slots] = slots[0]
     film: dict[str, Any] = {
         "text": one.texts[0] if one.texts else "",
         "width": W,
         "height": H,
         "count": T,
         "frames": picture_url(frames_THW3.reshape(T * H, W, 3)),  # one below the other
-        "runs": run_lengths(one.masks[0].argmax(1).cpu().numpy()),
+        "runs": run_lengths(first_K[one.masks[0].argmax(1).cpu().numpy()]),
         "colors": colors_K3.tolist(),
-        "slots": [{"slot": slot, "name": name} for slot, name in sorted(named.items(), key=itemgetter(1))],
+        "slots": [{"slot": slots[0], "name": name} for name, slots in sorted(shown.items())],
     }
     if one.attention is not None and words:
-        # Percent, the mean over layers and heads; frame 0 was seen, and shows the attention of the first step.
-        percent_SKL = (one.attention[0].mean((1, 2)) * 100).round().int().cpu()[..., : len(words)]
+        # Percent, the mean over layers, heads and slots of a thing; frame 0 was seen, and shows that of the first step.
+        share_SKL = one.attention[0].mean((1, 2)).cpu().numpy()[..., : len(words)]
+        for slots in shown.values():
+            share_SKL[:, slots[0]] = share_SKL[:, slots].mean(1)
+        percent_SKL = (100 * share_SKL).round().astype(int)
         film |= {"words": list(words), "attention": [percent_SKL[0].tolist(), *percent_SKL.tolist()]}
     if real is not None:
         if real.shape[1:] != frames_THW3.shape[1:]:

@@ -24,7 +24,7 @@ from envs.tasks.rearrange import FAMILIES
 from experiments.play.session import HORIZON, Link, Refused, Session, World, heard
 from planning import GroundingError
 from textocvp import WorldModel
-from textocvp.film_page import what_if_page, with_films
+from textocvp.film_page import with_films
 
 LARGEST_PICTURE = 20 * 2**20  # bytes of an upload
 IDLE_SECONDS = 300.0  # a page says something every minute; one that is silent for longer is closed
@@ -167,7 +167,7 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
         except (Refused, ValueError) as error:
             name, session = sessions.add(Link())  # says the same once more if there are too many pages
             problem = [str(error)]
-        about = {"model": repr(world_model), "families": [], "stacks": session.base.task.stacks}
+        about = {"model": repr(world_model), "plans": world_model.model.outcome is not None}
         about |= {"colors": list(COLORS), "families": list(FAMILIES) if session.base.task.stacks else []}
         return {"page": name, "about": about, "problems": problem, "scene": session.view()}
 
@@ -183,7 +183,7 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
 
     @app.post("/api/{name}/scene")
     def new_scene(name: str, query: Said) -> dict[str, Any]:
-        return ask(name, lambda session: session.show(Link.parse(query)))
+        return ask(name, lambda session: session.new_scene(Link.parse(query)))
 
     @app.post("/api/{name}/move")
     def move(name: str, thing: Annotated[int, Body()], x: Number, y: Number) -> dict[str, Any]:
@@ -202,8 +202,8 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
         return ask(name, lambda session: {"films": session.imagine(texts)}, view=False)
 
     @app.post("/api/{name}/do")
-    def do(name: str, text: Said) -> dict[str, Any]:
-        return ask(name, lambda session: session.do(text))
+    def do(name: str, text: Said, more: Annotated[bool, Body()] = False) -> dict[str, Any]:
+        return ask(name, lambda session: session.do(text, more))
 
     @app.post("/api/{name}/goal")
     def arrange_goal(name: str, what: Said) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
         return ask(name, lambda session: session.plan(text), view=False)
 
     @app.post("/api/{name}/picture")
-    async def upload(name: str, request: Request, crop: bool = False) -> dict[str, Any]:
+    async def upload(name: str, request: Request) -> dict[str, Any]:
         sessions.get(name)
         data = bytearray()
         async for part in request.stream():
@@ -224,22 +224,14 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
                 raise Refused(
                     f"the picture has {size:.0f} MB; at most {LARGEST_PICTURE // 2**20} MB are taken"
                 )
-        return await run_in_threadpool(ask, name, lambda one: {"done": one.upload(bytes(data), crop)})
+        return await run_in_threadpool(ask, name, lambda one: {"done": one.upload(bytes(data))})
 
     @app.get("/api/{name}/film.{kind}")
     def download(name: str, kind: str) -> Response:
         session = sessions.get(name)
-        with session.lock:
-            if session.last is None:
-                raise Refused("nothing has been imagined yet")
-            if kind not in MEDIA:
-                raise Refused(f"films are {', '.join(MEDIA)}, not {kind!r}")
-            rollout, real = session.last
-            if kind == "html":
-                data = what_if_page(" / ".join(rollout.texts), session.films(rollout, real)).encode()
-            else:
-                with tempfile.TemporaryDirectory() as folder:
-                    data = rollout.save(Path(folder, f"film.{kind}"), beside=real).read_bytes()
+        with session.lock, tempfile.TemporaryDirectory() as folder:
+            session.save(path := Path(folder, f"film.{kind}"))
+            data = path.read_bytes()
         headers = {"Content-Disposition": f'attachment; filename="imagined.{kind}"'}
         return Response(data, media_type=MEDIA[kind], headers=headers)
 

@@ -8,11 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 from typing import Any, cast
 from urllib.parse import parse_qsl, urlencode
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 import envs
 from envs.colors import COLORS
@@ -35,7 +37,8 @@ from planning import (
 from planning.controller import RESTING_HEIGHTS
 from planning.search import HORIZON
 from textocvp import Rollout, WorldModel
-from textocvp.film_page import film_data, picture_url
+from textocvp.drawing import SUFFIXES, save_film
+from textocvp.film_page import film_data, picture_url, save_page
 from textocvp.pictures import read_picture
 
 MOST_SENTENCES = 12  # side by side
@@ -147,7 +150,9 @@ class Session:
         self.picture: np.ndarray | None = None  # a person's own, instead of the scene
         self.goal: Goal | PictureGoal | None = None
         self.before_goal: Link | None = None  # the scene, while the goal is arranged
-        self.last: tuple[Rollout, np.ndarray | None] | None = None  # what may be downloaded
+        self.shown: list[
+            tuple[Rollout, np.ndarray | None]
+        ] = []  # imagined and real, in the order of the page
         try:
             self.show(link)
         except BaseException:
@@ -171,6 +176,11 @@ class Session:
         for act in link.acts:
             observation, *_, info = self.env.step(self._within_reach(act))
         self.link, self.rgb, self.info, self.picture = link, observation["rgb"], info, None
+
+    def new_scene(self, link: Link) -> None:
+        """Another scene, with no goal yet."""
+        self.show(link)
+        self.goal = self.before_goal = None
 
     def _within_reach(self, act: Sequence[float]) -> np.ndarray:
         space = cast(gym.spaces.Box, self.env.action_space)
@@ -276,10 +286,10 @@ class Session:
         if not 0 <= thing < len(self.info["objects"]):
             raise Refused(f"there is no thing number {thing}")
 
-    def upload(self, data: bytes, crop: bool = False) -> list[str]:
+    def upload(self, data: bytes) -> list[str]:
         """Take a picture file instead of the scene; what was done to it."""
         try:
-            picture, done = read_picture(BytesIO(data), self.world_model.image_size, resize=True, crop=crop)
+            picture, done = read_picture(BytesIO(data), self.world_model.image_size, resize=True)
         except (OSError, ValueError) as error:  # what no picture can be read from is an OSError, too
             raise Refused(f"this is no picture that can be read: {error}") from None
         except Exception as error:  # a picture of too many pixels, or one damaged in a way of its own
@@ -295,7 +305,7 @@ class Session:
         if not 1 <= len(texts) <= MOST_SENTENCES:
             raise Refused(f"give 1 to {MOST_SENTENCES} sentences, not {len(texts)}")
         rollout = self._imagined(texts)
-        self.last = rollout, None
+        self.shown = [(rollout, None)]
         return self.films(rollout)
 
     def _imagined(self, texts: Sequence[str]) -> Rollout:
@@ -308,8 +318,12 @@ class Session:
         words = [self.world_model.words(text) for text in rollout.texts]
         return [film_data(rollout, words[row], names, row=row, real=real) for row in range(len(rollout))]
 
-    def do(self, text: str) -> dict[str, Any]:
-        """Carry a sentence out: the imagined film beside what happened, and whether the goal is reached."""
+    def do(self, text: str, more: bool = False) -> dict[str, Any]:
+        """Carry a sentence out: the imagined film beside what happened, and whether the goal is reached.
+
+        Args:
+            more: whether the page shows it beside what was done before.
+        """
         if self.picture is not None:
             raise Refused("this is your own picture, with no robot behind it; go back to the scene to act")
         if len(self.link.acts) >= MOST_ACTS:
@@ -326,8 +340,29 @@ class Session:
         self.rgb = observation["rgb"]
         self.link = Link(self.link.seed, self.link.family, self.link.layout, (*self.link.acts, act))
         real = np.stack(film_THW3)
-        self.last = rollout, real
+        self.shown = [*(self.shown if more else ()), (rollout, real)]
         return {"film": self.films(rollout, real)[0], **self.goal_state()}
+
+    def save(self, path: Path) -> None:
+        """What the page shows as a GIF, MP4 or PNG, or as a page of its own; acts and plans one after another."""
+        if not self.shown:
+            raise Refused("nothing has been imagined yet")
+        if path.suffix == ".html":
+            films = [film for rollout, real in self.shown for film in self.films(rollout, real)]
+            save_page(path, "; ".join(film["text"] for film in films), films)
+        elif path.suffix in SUFFIXES:
+            frames, masks = (
+                torch.cat([getattr(rollout, name) for rollout, _ in self.shown], dim=1).cpu().numpy()
+                for name in ("frames", "masks")
+            )
+            texts = [
+                ", then ".join(parts) for parts in zip(*(one.texts for one, _ in self.shown), strict=True)
+            ]
+            # A real film is as long as the imagined one, so that both stay in step.
+            reals = [real[: one.slots.shape[1]] for one, real in self.shown if real is not None]
+            save_film(path, frames, masks, texts, beside=np.concatenate(reals) if reals else None)
+        else:
+            raise Refused(f"films are {', '.join(SUFFIXES)} and .html, not {path.suffix!r}")
 
     def _read(self, text: str) -> Instruction:
         """A sentence of any wording that the model understands."""
@@ -390,6 +425,7 @@ class Session:
         if state["reached"]["seen"]:
             return {"goal": self._goal_data(), "done": True, **state}
         plan = self._planner.plan(self.rgb, self.goal, self._grounder)
+        self.shown = [(one, None) for one in plan.rollouts]
         films = [film_data(one, (), self._names(plan.grounding)) for one in plan.rollouts]
         shown = [one.instructions for one in plan.ranking[:BRANCHES]]
         reaching = {one.instructions for one in plan.ranking if one.reaches_goal}
@@ -427,13 +463,13 @@ class Session:
             return {"picture": picture_url(self.goal.rgb)}
         return {"text": " and ".join(one.text for one in cast(Goal, self.goal).instructions)}
 
-    def _ends(self, paths: Sequence[Path]) -> dict[Path, tuple[np.ndarray, Rollout]]:
+    def _ends(self, paths: Sequence[Said]) -> dict[Said, tuple[np.ndarray, Rollout]]:
         """Where sequences of sentences, and all their beginnings, are imagined to lead: a picture and the slots."""
-        level: dict[Path, Rollout] = {(): self.world_model.parse(self.rgb[None])}
-        ends: dict[Path, tuple[np.ndarray, Rollout]] = {}
+        level: dict[Said, Rollout] = {(): self.world_model.parse(self.rgb[None])}
+        ends: dict[Said, tuple[np.ndarray, Rollout]] = {}
         for depth in range(1, 1 + max(map(len, paths))):
             wanted = list(dict.fromkeys(path[:depth] for path in paths if len(path) >= depth))
-            imagined: dict[Path, Rollout] = {}
+            imagined: dict[Said, Rollout] = {}
             for before, start in level.items():
                 after = [path for path in wanted if path[:-1] == before]
                 if after:
@@ -460,10 +496,10 @@ class Session:
         return {"sentences": [one.text for one in asked], "picture": picture_url(frame), "wrong": wrong}
 
 
-Path = tuple[Instruction, ...]
+Said = tuple[Instruction, ...]  # one after another
 
 
-def _order(path: Path, shown: Sequence[Path]) -> tuple[int, ...]:
+def _order(path: Said, shown: Sequence[Said]) -> tuple[int, ...]:
     """So that a tree is written from its root, best branches first."""
     return tuple(
         min(n for n, one in enumerate(shown) if one[:k] == path[:k]) for k in range(1, len(path) + 1)

@@ -242,7 +242,13 @@ def test_films_can_be_downloaded(open_page, tmp_path: Path) -> None:
         assert len(iio.imread(tmp_path / f"film.{kind}")) == HORIZON + 1
     sent = page.client.get(f"/api/{page.name}/film.html").text
     assert ASKED in sent and "red block" in sent
-    assert "not 'exe'" in page.client.get(f"/api/{page.name}/film.exe").json()["error"]
+    # Acts that the page shows beside each other are one film, and one page.
+    for more in (False, True):
+        page.ask("do", text=("put the brown block in the gray bowl", ASKED)[more], more=more)
+    film = iio.imread(page.client.get(f"/api/{page.name}/film.gif").content, extension=".gif")
+    assert len(film) == 2 * (HORIZON + 1) and film.shape[2] > 3 * 256
+    assert page.client.get(f"/api/{page.name}/film.html").text.count('"real"') == 2
+    assert "not '.exe'" in page.client.get(f"/api/{page.name}/film.exe").json()["error"]
 
 
 def test_pages_are_counted_and_closed(world_model) -> None:
