@@ -238,6 +238,26 @@ def test_dragging_asks_the_environment(visit) -> None:
     assert page.locator("#scene").get_attribute("src") != before
 
 
+def test_a_goal_is_arranged(visit) -> None:
+    page = visit("?seed=3&family=plain")
+    use = page.get_by_role("button", name="this is the goal")
+    expect(use).not_to_be_visible()
+    before = page.locator("#scene").get_attribute("src")
+    press(page, "arrange the goal")
+    expect(use).to_be_visible()
+    assert page.get_by_role("button", name="plan", exact=True).is_disabled()
+    names = page.locator("#things button").all_inner_texts()
+    block, bowl = (next(name for name in names if kind in name) for kind in ("block", "bowl"))
+    page.locator(f"#stage span[title='{block}']").drag_to(page.locator(f"#stage span[title='{bowl}']"))
+    expect(page.locator("#message")).to_contain_text("Done")
+    assert page.locator("#scene").get_attribute("src") != before
+    use.click()
+    expect(page.locator("#message")).to_contain_text("press plan")
+    assert page.locator("#scene").get_attribute("src") == before
+    press(page, "plan")
+    expect(page.get_by_text(f"the {block} in the {bowl}. It is imagined to reach the goal.")).to_be_visible()
+
+
 def test_a_page_that_was_sent_opens_offline(browser, tmp_path: Path) -> None:
     world_model = WorldModel.from_pretrained()
     picture = np.full((64, 64, 3), 47, np.uint8)
