@@ -21,7 +21,8 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from envs.colors import COLORS
 from envs.tasks.rearrange import FAMILIES
-from experiments.play.session import HORIZON, Link, Refused, Session, World, heard
+from experiments.play.links import Link, Refused
+from experiments.play.session import HORIZON, Session, World, heard
 from planning import GroundingError
 from textocvp import WorldModel
 from textocvp.film_page import with_films

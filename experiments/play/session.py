@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
-from urllib.parse import parse_qsl, urlencode
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-import envs
 from envs.colors import COLORS
 from envs.tabletop import TabletopEnv
+from experiments.play.links import MOST_ACTS, Link, Refused
+from experiments.play.plans import plan_data
 from planning import (
     RELATIONS,
     AppearanceGrounder,
@@ -31,8 +31,6 @@ from planning import (
     PinholeCamera,
     SearchPlanner,
     Thing,
-    places,
-    seen_supports,
 )
 from planning.controller import RESTING_HEIGHTS
 from planning.search import HORIZON
@@ -42,12 +40,6 @@ from textocvp.film_page import film_data, picture_url, save_page
 from textocvp.pictures import read_picture
 
 MOST_SENTENCES = 12  # side by side
-BRANCHES = 12  # sequences of sentences that the tree of a plan shows
-MOST_ACTS = 100  # pick-and-places that a link repeats
-
-
-class Refused(Exception):
-    """What a person asked for and cannot have; the sentence is shown in the page."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +57,11 @@ class World:
 
 
 WORLDS = {
-    "tabletop": World("PutBlockInBowl-v0", "tabletop-small", {}),
-    "rearrange": World("RearrangeBlocks-v0", "tabletop-small", {}),
-    "cliport": World("PutBlockInBowl-v0", "cliport", {"scene": "cliport"}),
+    "tabletop": World("envs:PutBlockInBowl-v0", "tabletop-small", {}),
+    "rearrange": World("envs:RearrangeBlocks-v0", "tabletop-small", {}),
+    "cliport": World("envs:PutBlockInBowl-v0", "cliport", {"scene": "cliport"}),
 }
-assert set(envs.TASKS), "importing envs registers the environments"
+Shown = tuple[Rollout, np.ndarray | None]  # imagined, and what happened (T, H, W, 3) where it was carried out
 
 _heard = threading.local()
 
@@ -92,47 +84,6 @@ def _keep(message: Warning | str, *_: Any, **__: Any) -> None:
         _heard.sentences.append(str(message))
 
 
-@dataclass(frozen=True)
-class Link:
-    """All that makes a scene: what the query string of a link says."""
-
-    seed: int = 0
-    family: str = ""  # of a random scene of the world "rearrange"
-    layout: tuple[tuple[str, str, float, float, float, float], ...] = ()  # kind, colour, x, y, z and yaw
-    acts: tuple[tuple[float, ...], ...] = ()  # pick-and-places since then
-
-    def query(self) -> str:
-        """As a query string."""
-        said = {"seed": str(self.seed), "family": self.family}
-        said |= {"layout": ";".join(",".join(map(str, item)) for item in self.layout)}
-        said |= {"acts": ";".join(",".join(map(str, act)) for act in self.acts)}
-        return urlencode({name: value for name, value in said.items() if value}, safe=",;")
-
-    @classmethod
-    def parse(cls, query: str) -> Link:
-        """The inverse of `query`; what else the link says is left alone. Refused for what is no link."""
-        said = dict(parse_qsl(query.removeprefix("?")))
-        try:
-            items = [item.split(",") for item in said.get("layout", "").split(";") if item]
-            layout = tuple((kind, color, *map(float, rest)) for kind, color, *rest in items)
-            acts = tuple(tuple(map(float, act.split(","))) for act in said.get("acts", "").split(";") if act)
-        except ValueError:
-            layout, acts = ((),), ()
-        if not (all(len(item) == 6 for item in layout) and all(len(act) == 4 for act in acts)):
-            raise Refused("the link is damaged: its layout or its acts cannot be read")
-        if len(acts) > MOST_ACTS:
-            raise Refused(f"the link repeats {len(acts)} acts; at most {MOST_ACTS} are")
-        return cls(read_seed(said.get("seed", "0")), said.get("family", ""), cast(Any, layout), acts)
-
-
-def read_seed(text: str) -> int:
-    """A seed as a person types it."""
-    text = text.strip()
-    if not (text.isascii() and text.isdigit() and len(text) < 20):
-        raise Refused(f"the seed must be a whole number of at least 0 and less than 20 digits, not {text!r}")
-    return int(text)
-
-
 class Session:
     """One page's scene. Its methods are called by one thread at a time; `lock` sees to that.
 
@@ -150,9 +101,8 @@ class Session:
         self.picture: np.ndarray | None = None  # a person's own, instead of the scene
         self.goal: Goal | PictureGoal | None = None
         self.before_goal: Link | None = None  # the scene, while the goal is arranged
-        self.shown: list[
-            tuple[Rollout, np.ndarray | None]
-        ] = []  # imagined and real, in the order of the page
+        self.goal_supports: tuple[int, ...] = ()  # of a goal that was arranged
+        self.shown: list[Shown] = []  # what may be downloaded, in the order of the page
         try:
             self.show(link)
         except BaseException:
@@ -250,9 +200,7 @@ class Session:
 
     def _rearrange(self, rows: Sequence[Sequence[Any]]) -> None:
         if self.picture is not None:
-            raise Refused(
-                "this is your own picture: nothing in it can be moved; go back to the scene for that"
-            )
+            raise Refused("this is your own picture, in which nothing can be moved; go back to the scene")
         self.show(Link(self.link.seed, "", tuple(tuple(row) for row in rows)))
 
     def move(self, thing: int, x: float, y: float) -> None:
@@ -294,8 +242,8 @@ class Session:
             raise Refused(f"this is no picture that can be read: {error}") from None
         except Exception as error:  # a picture of too many pixels, or one damaged in a way of its own
             raise Refused(f"this picture cannot be taken: {error}") from None
-        self.picture = picture
         self.world_model.parse(picture[None])  # which warns of a foreign picture
+        self.picture = picture
         return done
 
     # -- imagining and doing -----------------------------------------------------------------------------------
@@ -314,7 +262,7 @@ class Session:
 
     def films(self, rollout: Rollout, real: np.ndarray | None = None) -> list[dict[str, Any]]:
         """Films with the names of their things."""
-        names = self._names(self._grounder(rollout.select(0)))
+        names = _names(self._grounder(rollout.select(0)))
         words = [self.world_model.words(text) for text in rollout.texts]
         return [film_data(rollout, words[row], names, row=row, real=real) for row in range(len(rollout))]
 
@@ -324,8 +272,7 @@ class Session:
         Args:
             more: whether the page shows it beside what was done before.
         """
-        if self.picture is not None:
-            raise Refused("this is your own picture, with no robot behind it; go back to the scene to act")
+        self._check_scene()
         if len(self.link.acts) >= MOST_ACTS:
             raise Refused(f"{MOST_ACTS} acts were carried out in this scene; take a new one")
         instruction = self._read(text)
@@ -355,9 +302,8 @@ class Session:
                 torch.cat([getattr(rollout, name) for rollout, _ in self.shown], dim=1).cpu().numpy()
                 for name in ("frames", "masks")
             )
-            texts = [
-                ", then ".join(parts) for parts in zip(*(one.texts for one, _ in self.shown), strict=True)
-            ]
+            rows = zip(*(rollout.texts for rollout, _ in self.shown), strict=True)
+            texts = [", then ".join(parts) for parts in rows]
             # A real film is as long as the imagined one, so that both stay in step.
             reals = [real[: one.slots.shape[1]] for one, real in self.shown if real is not None]
             save_film(path, frames, masks, texts, beside=np.concatenate(reals) if reals else None)
@@ -378,9 +324,9 @@ class Session:
     def arrange_goal(self, what: str) -> None:
         """Begin to arrange the scene as it shall be; `use` that as the goal, or `cancel`: both bring the scene back."""
         if what == "begin":
-            if self.picture is not None:
-                raise Refused("this is your own picture; go back to the scene to arrange a goal")
-            self.before_goal = self.before_goal or self.link
+            self._check_scene()
+            self.before_goal = self.link
+            self._rearrange(self._layout())  # which stands still as it is after acts
             return
         if self.before_goal is None:
             raise Refused("no goal is being arranged")
@@ -393,16 +339,19 @@ class Session:
         """Whether the goal is seen to be reached, and whether the simulator says so; nothing without a goal."""
         if self.goal is None:
             return {}
-        ids = {(item["color"], item["kind"]): number for number, item in enumerate(self.info["objects"])}
-        supports = list(self.info["supports"])
-        if isinstance(self.goal, PictureGoal):
-            true = supports == list(self.goal_supports)
-        else:
-            ends = [
-                [ids.get((one.color, one.kind)) for one in asked.things] for asked in self.goal.instructions
-            ]
-            true = all(None not in pair and supports[cast(int, pair[0])] == pair[1] for pair in ends)
+        true = False
+        with suppress(ValueError):  # what the goal names may have been taken away
+            true = self._is_reached(self.goal)
         return {"reached": {"seen": self._planner.reached(self.rgb, self.goal, self._grounder), "true": true}}
+
+    def _is_reached(self, goal: Goal | PictureGoal) -> bool:
+        """The environment's own verdict; a ValueError for a goal that cannot be one here."""
+        if isinstance(goal, PictureGoal):
+            return tuple(self.info["supports"]) == self.goal_supports
+        task, objects = self.base.task, self.base.scene.objects
+        asked = task.parse("put " + " and ".join(one.text.removeprefix("put ") for one in goal.instructions))
+        scene = task.scene(objects, task.find_goal(objects, asked))
+        return task.succeeded(self.base.world, self.base.robot, scene)
 
     @property
     def _planner(self) -> SearchPlanner:
@@ -410,104 +359,36 @@ class Session:
 
     def plan(self, text: str) -> dict[str, Any]:
         """Search for the goal of a sentence, or for the one that was arranged where there is no sentence."""
-        if self.picture is not None or self.before_goal is not None:
-            raise Refused("plans are made for the scene: go back to it first")
-        if text.strip():
-            self.goal = Goal.parse(text)
-        if self.goal is None:
+        self._check_scene()
+        goal = Goal.parse(text) if text.strip() else self.goal
+        if goal is None:
             raise Refused("say what the goal is, or arrange it")
         if self.world_model.model.outcome is None:
             raise Refused(
                 f"the checkpoint {self.world_model.checkpoint.name} cannot foresee where sentences lead, which a "
                 "plan is made of; tabletop-small can"
             )
+        self._is_reached(goal)
+        self.goal = goal
         state = self.goal_state()
         if state["reached"]["seen"]:
-            return {"goal": self._goal_data(), "done": True, **state}
-        plan = self._planner.plan(self.rgb, self.goal, self._grounder)
+            return {"done": True, **state}
+        plan = self._planner.plan(self.rgb, goal, self._grounder)
         self.shown = [(one, None) for one in plan.rollouts]
-        films = [film_data(one, (), self._names(plan.grounding)) for one in plan.rollouts]
-        shown = [one.instructions for one in plan.ranking[:BRANCHES]]
-        reaching = {one.instructions for one in plan.ranking if one.reaches_goal}
-        scores = {one.instructions: round(-one.score, 1) for one in plan.ranking}
-        ends = self._ends(shown)
-        best = plan.best.instructions
-        nodes = [
-            {
-                "text": path[-1].text,
-                "depth": len(path),
-                "picture": picture_url(frame),
-                "away": scores.get(path),
-                "reaches": path in reaching,
-                "chosen": path == best[: len(path)],
-            }
-            for path, (frame, _) in sorted(ends.items(), key=lambda one: _order(one[0], shown))
-        ]
-        return {
-            "goal": self._goal_data(),
-            "done": False,
-            "sentences": [one.text for one in best],
-            "reaches": plan.best.reaches_goal,
-            "seconds": round(plan.seconds, 1),
-            "tree": nodes,
-            "films": films,
-            "obvious": self._obvious(plan.grounding),
-        }
+        names = _names(plan.grounding)
+        films = [film_data(one, (), names) for one in plan.rollouts]
+        return {"done": False, "films": films, **plan_data(self.world_model, self.rgb, goal, plan)}
 
-    def _names(self, grounding: Grounding) -> dict[int, str]:
-        things = {slot: str(thing) for thing, slots in grounding.things.items() for slot in slots}
-        return things | {slot: "arm" for slot in grounding.arm}
-
-    def _goal_data(self) -> dict[str, Any]:
-        if isinstance(self.goal, PictureGoal):
-            return {"picture": picture_url(self.goal.rgb)}
-        return {"text": " and ".join(one.text for one in cast(Goal, self.goal).instructions)}
-
-    def _ends(self, paths: Sequence[Said]) -> dict[Said, tuple[np.ndarray, Rollout]]:
-        """Where sequences of sentences, and all their beginnings, are imagined to lead: a picture and the slots."""
-        level: dict[Said, Rollout] = {(): self.world_model.parse(self.rgb[None])}
-        ends: dict[Said, tuple[np.ndarray, Rollout]] = {}
-        for depth in range(1, 1 + max(map(len, paths))):
-            wanted = list(dict.fromkeys(path[:depth] for path in paths if len(path) >= depth))
-            imagined: dict[Said, Rollout] = {}
-            for before, start in level.items():
-                after = [path for path in wanted if path[:-1] == before]
-                if after:
-                    batch = self.world_model.outcome(start, [path[-1].text for path in after])
-                    imagined |= {path: batch.select(row).last for row, path in enumerate(after)}
-            for path, one in imagined.items():
-                frame_3HW = one.decode_frames([0])[0, 0]
-                ends[path] = (frame_3HW.permute(1, 2, 0).mul(255).round().byte().cpu().numpy(), one)
-            level = imagined
-        return ends
-
-    def _obvious(self, grounding: Grounding) -> dict[str, Any] | None:
-        """The goal's own sentences, one after another: where they are imagined to lead, and what is wrong with that."""
-        if isinstance(self.goal, PictureGoal) or self.goal is None:
-            return None
-        asked, things = self.goal.instructions, sorted(grounding.things)
-        frame, end = self._ends([asked])[asked]
-        carriers = seen_supports(places(end, grounding, things), things)[0]
-        wrong = [
-            f"the {one.thing} is imagined to end {_where(carriers[one.thing])}, not {one.relation} the {one.target}"
-            for one in asked
-            if carriers.get(one.thing) != one.target
-        ]
-        return {"sentences": [one.text for one in asked], "picture": picture_url(frame), "wrong": wrong}
+    def _check_scene(self) -> None:
+        if self.picture is not None:
+            raise Refused("this is your own picture, with no robot behind it; go back to the scene for that")
+        if self.before_goal is not None:
+            raise Refused("a goal is being arranged: say that this is the goal, or cancel")
 
 
-Said = tuple[Instruction, ...]  # one after another
-
-
-def _order(path: Said, shown: Sequence[Said]) -> tuple[int, ...]:
-    """So that a tree is written from its root, best branches first."""
-    return tuple(
-        min(n for n, one in enumerate(shown) if one[:k] == path[:k]) for k in range(1, len(path) + 1)
-    )
-
-
-def _where(carrier: Thing | None) -> str:
-    return "on the table" if carrier is None else f"{'in' if carrier.kind == 'bowl' else 'on'} the {carrier}"
+def _names(grounding: Grounding) -> dict[int, str]:
+    things = {slot: str(thing) for thing, slots in grounding.things.items() for slot in slots}
+    return things | {slot: "arm" for slot in grounding.arm}
 
 
 def _as_item(item: Sequence[Any]) -> dict[str, Any]:
