@@ -188,7 +188,7 @@ class Session:
             rows.append([item["kind"], item["color"], *numbers])
         return rows
 
-    def _put_down(self, kind: str, x: float, y: float, others: Sequence[Sequence[Any]]) -> list[float]:
+    def _put_down(self, kind: str, x: float, y: float, others: Sequence[Sequence[Any]]) -> list[Any]:
         """Where a thing comes to stand that is let go at a pixel: a block over the middle of what is under it."""
         camera, sizes = PinholeCamera.from_info(self.info["camera"]), self.base.setup.sizes
         place, height = camera.unproject_to_plane((x, y), RESTING_HEIGHTS[kind])[:2], sizes.block / 2
@@ -196,7 +196,7 @@ class Session:
         for other, _, *its, z, _ in sorted(others, key=lambda row: row[4]) if kind == "block" else ():
             if np.hypot(*(place - its)) < reach[other]:
                 place, height = np.array(its), (z + sizes.block if other == "block" else height)
-        return [round(float(value), 4) for value in (*place, height)]
+        return [*place, height]
 
     def _rearrange(self, rows: Sequence[Sequence[Any]]) -> None:
         if self.picture is not None:
@@ -204,11 +204,17 @@ class Session:
         self.show(Link(self.link.seed, "", tuple(tuple(row) for row in rows)))
 
     def move(self, thing: int, x: float, y: float) -> None:
-        """Put a thing down at a pixel."""
-        rows = self._layout()
+        """Put a thing, with what it carries, down at a pixel."""
         self._check(thing)
-        others = [row for number, row in enumerate(rows) if number != thing]
-        rows[thing][2:5] = self._put_down(rows[thing][0], x, y, others)
+        rows, supports = self._layout(), self.info["supports"]
+        moved = {thing}
+        for _ in rows:  # as high as towers can be
+            moved |= {number for number, support in enumerate(supports) if support in moved}
+        others = [row for number, row in enumerate(rows) if number not in moved]
+        before = np.array(rows[thing][2:5])
+        by = np.array(self._put_down(rows[thing][0], x, y, others)) - before
+        for number in moved:
+            rows[number][2:5] = [round(float(value), 4) for value in np.add(rows[number][2:5], by)]
         self._rearrange(rows)
 
     def remove(self, thing: int) -> None:

@@ -151,6 +151,20 @@ def test_a_goal_is_arranged_and_planned_for(open_page) -> None:
     assert page.ask("do", text=plan["sentences"][0])["reached"] == {"seen": True, "true": True}
 
 
+def test_a_bowl_is_moved_with_what_lies_in_it(open_page) -> None:
+    page = open_page(OCCUPIED)
+    names = {one["name"]: one for one in page.scene["things"]}
+    page.ask("remove", thing=names["white bowl"]["id"])
+    before = {one["name"]: np.array(one["at"]) for one in page.scene["things"]}
+    bowl = next(one["id"] for one in page.scene["things"] if one["name"] == "cyan bowl")
+    page.ask("move", thing=bowl, x=22.0, y=20.0)
+    after = {one["name"]: np.array(one["at"]) for one in page.scene["things"]}
+    assert np.abs(after["cyan bowl"] - (22, 20)).max() < 2
+    shift = {name: after[name] - before[name] for name in before}
+    assert np.abs(shift["brown block"] - shift["cyan bowl"]).max() < 1.5
+    assert all(np.abs(shift[name]).max() < 0.2 for name in ("red block", "gray bowl", "yellow bowl"))
+
+
 @pytest.mark.parametrize(
     ("verb", "body", "said"),
     [

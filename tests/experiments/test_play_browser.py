@@ -190,6 +190,18 @@ def test_the_keyboard_is_enough(visit) -> None:
     moved = page.locator("#stage span[title='yellow bowl']").evaluate("one => parseFloat(one.style.left)")
     assert moved > 15 and at != moved
     expect(page.get_by_role("button", name="yellow bowl")).to_be_focused()
+    # A block leaves the bowl that it lies in when the key is pressed again and again.
+    brown = page.locator("#stage span[title='brown block']")
+    at = brown.evaluate("one => parseFloat(one.style.left)")
+    page.get_by_role("button", name="brown block").focus()
+    for _ in range(8):
+        page.keyboard.press("ArrowLeft")
+        expect(page.locator("#message.busy")).to_have_count(0)
+        if brown.evaluate("one => parseFloat(one.style.left)") < at - 5:
+            break
+    else:
+        raise AssertionError("the block is still in the bowl")
+    page.get_by_role("button", name="yellow bowl").focus()
     page.keyboard.press("Delete")
     expect(page.get_by_role("button", name="yellow bowl")).to_have_count(0)
     page.get_by_label("sentence").focus()
