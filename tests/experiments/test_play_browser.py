@@ -181,6 +181,18 @@ def test_two_tabs_at_once_and_one_too_many(visit) -> None:
     expect(last.locator("#message.bad")).to_contain_text("must be a whole number")
 
 
+def test_the_first_sentence_of_any_scene_can_be_done(visit) -> None:
+    page = visit("?seed=3&family=swap")  # its goal are two sentences
+    expect(page.locator("#message")).to_contain_text("Ready")
+    assert " and " in page.get_by_label("goal", exact=True).input_value()
+    for family in ("swap", "picture"):
+        page.locator("#family").select_option(family)
+        press(page, "show")
+        expect(page.locator("#message")).to_contain_text("Done")
+        press(page, "do it")
+        expect(page.get_by_text("what happened", exact=True)).to_have_count(1)
+
+
 def test_the_keyboard_is_enough(visit) -> None:
     page = visit()
     at = page.locator("#stage span").first.evaluate("one => parseFloat(one.style.left)")
