@@ -1,4 +1,4 @@
-"""The command line: `textocvp train`, `rollout`, `models`, `info`, `measure` and `weights`."""
+"""The command line: `textocvp train`, `rollout`, `play`, `models`, `info`, `measure` and `weights`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -30,6 +31,7 @@ from textocvp.checkpoint import (
 )
 from textocvp.config import ModelConfig, with_settings
 from textocvp.drawing import SUFFIXES
+from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
@@ -79,6 +81,13 @@ class RolloutCommand:
     """The same, but cut off what does not fit its shape."""
     device: str = "cpu"
     """Where to compute: cpu, cuda, mps."""
+    html: Path | None = None
+    """Also write one page to send: films, masks and attention, in a single file that opens offline."""
+
+
+@dataclass
+class PlayCommand:
+    """Play with a model in a browser; `textocvp play --help` says more."""
 
 
 @dataclass
@@ -121,6 +130,7 @@ class WeightsCommand:
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
+    Annotated[PlayCommand, tyro.conf.subcommand("play")],
     Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
     Annotated[MeasureCommand, tyro.conf.subcommand("measure")],
@@ -134,6 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
+            if arguments[:1] == ["play"]:
+                return _play(arguments[1:])
             _run(arguments)
     except (Mistake, CheckpointError) as error:
         print(f"textocvp: {error}", file=sys.stderr)
@@ -216,6 +228,13 @@ def _train(arguments: list[str]) -> None:
         raise Mistake(str(error)) from error
 
 
+def _play(arguments: list[str]) -> int:
+    """The page needs the simulator and the planner, of which this package knows nothing: they announce it."""
+    for announced in entry_points(group="textocvp.commands", name="play"):
+        return int(announced.load()(arguments))
+    raise Mistake("to play, install the whole package: pip install -e '.[play]'")
+
+
 def _rollout(command: RolloutCommand) -> None:
     if command.out.suffix.lower() not in SUFFIXES:
         raise Mistake(f"--out {command.out}: the name must end in {', '.join(SUFFIXES)}")
@@ -243,7 +262,9 @@ def _rollout(command: RolloutCommand) -> None:
     for what in done:
         print(f"{command.image}: {what}")
     try:
-        imagined = world_model.rollout(picture, texts, horizon=command.horizon, seed=command.seed)
+        imagined = world_model.rollout(
+            picture, texts, horizon=command.horizon, seed=command.seed, attention=command.html is not None
+        )
     except ValueError as error:
         raise Mistake(str(error)) from error
     for text in texts:
@@ -251,6 +272,9 @@ def _rollout(command: RolloutCommand) -> None:
             print(f"{text!r} is read as {read!r}")
     print(imagined)
     print(f"wrote {imagined.save(command.out)}")
+    if command.html is not None:
+        films = [film_data(imagined, world_model.words(text), row=row) for row, text in enumerate(texts)]
+        print(f"wrote {save_page(command.html, command.image.name, films)}")
 
 
 def _measure(command: MeasureCommand) -> None:

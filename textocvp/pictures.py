@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from textocvp.inputs import times_larger
 
 
 def read_picture(
-    path: Path, image_size: tuple[int, int], *, resize: bool = False, crop: bool = False
+    path: Path | BinaryIO, image_size: tuple[int, int], *, resize: bool = False, crop: bool = False
 ) -> tuple[NDArray[np.uint8], list[str]]:
     """A picture file as RGB (H, W, 3), 0..255, and what was done to it, in words.
 

@@ -1,0 +1,123 @@
+"""The command `textocvp play`."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+
+class Mistake(Exception):
+    """Something the user can put right; shown without a traceback."""
+
+
+@dataclass
+class PlayCommand:
+    """Play with the world model in a browser: change a scene, imagine sentences, carry them out, make plans."""
+
+    checkpoint: str | None = None
+    """A bundled name, a folder, or a Hugging Face hub id owner/name; by default the one that knows the world."""
+    world: Literal["rearrange", "tabletop", "cliport"] = "rearrange"
+    """rearrange: blocks into bowls and onto blocks. tabletop: into bowls. cliport: the same on CLIPort's table."""
+    port: int = 7860
+    """Where to listen; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """By default only this machine can open the page. With another address, such as 0.0.0.0, everyone who reaches this
+    machine over the network can, without a password."""
+    most_pages: int = 8
+    """That may be open at once; each has a simulator of its own."""
+    threads: int = 1
+    """Threads for one imagination. Films are small: one thread is as fast as two, and leaves the other to others."""
+    browser: bool = True
+    """Open the page in a browser."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve the page until Ctrl-C; the exit status."""
+    command = tyro.cli(PlayCommand, prog="textocvp play", args=arguments)
+    try:
+        serve(command)
+    except Mistake as error:
+        print(f"textocvp: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("textocvp: stopped", file=sys.stderr)
+    return 0
+
+
+def serve(command: PlayCommand) -> None:
+    """Listen, load the model, print the address, and serve; a Mistake where one of these cannot be."""
+    if command.most_pages < 1:
+        raise Mistake(f"--most-pages must be at least 1, not {command.most_pages}")
+    listening = listen(command.host, command.port)
+    # Loaded only now, because it takes seconds.
+    try:
+        import torch
+        import uvicorn
+        from fastapi.middleware.trustedhost import TrustedHostMiddleware
+
+        from experiments.play.server import create_app
+        from experiments.play.session import WORLDS
+    except ModuleNotFoundError as error:
+        if error.name not in ("fastapi", "uvicorn"):
+            raise
+        raise Mistake(f"the page needs {error.name}: pip install 'textocvp[play]'") from None
+    from textocvp.checkpoint import CheckpointError
+    from textocvp.world_model import WorldModel
+
+    torch.set_num_threads(max(1, command.threads))
+    world = WORLDS[command.world]
+    try:
+        world_model = WorldModel.from_pretrained(command.checkpoint or world.checkpoint)
+    except CheckpointError as error:
+        raise Mistake(str(error)) from None
+    app = create_app(world_model, world, command.most_pages)
+    host, port = listening.getsockname()[:2]
+    alone = is_loopback(host)
+    shown = f"[{host}]" if ":" in host else host
+    url = f"http://{shown if alone else socket.gethostname()}:{port}/"
+    print(f"textocvp play: {url} (Ctrl-C ends it)", flush=True)
+    if alone:  # a page of another host that calls itself by a name for this one is not answered
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, "localhost"])
+    else:
+        said = f"--host {command.host}: everyone who reaches this machine over the network can open the page"
+        print(f"textocvp: {said}, without a password", file=sys.stderr, flush=True)
+    if command.browser:
+        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
+    uvicorn.Server(config).run(sockets=[listening])
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens; a Mistake that says why there is none."""
+    if not 0 <= port <= 65535:
+        raise Mistake(f"--port {port}: ports are numbers from 0 to 65535, and 0 takes a free one")
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    except OSError:
+        raise Mistake(f"--host {host}: this machine knows no such address") from None
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+        listening.listen(128)
+    except OSError as error:
+        listening.close()
+        raise Mistake(f"cannot listen at {host}, port {port}: {error.strerror}; try another --port") from None
+    return listening
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine alone."""
+    return ipaddress.ip_address(host).is_loopback
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""The web application: one page, and what it asks for. What is slow runs in threads: no page waits for another."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import tempfile
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import Body, FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+
+from envs.colors import COLORS
+from envs.tasks.rearrange import FAMILIES
+from experiments.play.links import Link, Refused
+from experiments.play.session import HORIZON, Session, World, heard
+from planning import GroundingError
+from textocvp import WorldModel
+from textocvp.film_page import with_films
+
+LARGEST_PICTURE = 20 * 2**20  # bytes of an upload
+IDLE_SECONDS = 300.0  # a page says something every minute; one that is silent for longer is closed
+# Nothing of another host is ever asked for.
+POLICY = "default-src 'self' data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; base-uri 'none'"
+MEDIA = {"gif": "image/gif", "mp4": "video/mp4", "png": "image/png", "html": "text/html"}
+Said = Annotated[str, Body(embed=True)]
+Number = Annotated[float, Body(embed=True)]
+
+
+class Closed(Exception):
+    """A page asks whose session has ended."""
+
+
+@dataclass
+class Sessions:
+    """The open pages, at most `most`."""
+
+    make: Callable[[Link], Session]
+    most: int
+    idle_seconds: float = IDLE_SECONDS
+    open: dict[str, Session] = field(default_factory=dict)
+    heard_of: dict[str, float] = field(default_factory=dict)  # when each last said something
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, link: Link) -> tuple[str, Session]:
+        """A new page."""
+        self.sweep()
+        with self.lock:
+            if len(self.open) >= self.most:
+                raise Refused(
+                    f"{len(self.open)} pages are open, and no more may be (--most-pages {self.most}); close one"
+                )
+            name = secrets.token_urlsafe(12)
+            # Made while others wait, which takes milliseconds: so there are never too many.
+            self.open[name], self.heard_of[name] = self.make(link), time.monotonic()
+            return name, self.open[name]
+
+    def get(self, name: str) -> Session:
+        """An open page; Closed for one that is not."""
+        with self.lock:
+            if (session := self.open.get(name)) is None:
+                raise Closed(
+                    "this page was closed, because nothing was heard of it for a while; load it again"
+                )
+            self.heard_of[name] = time.monotonic()
+            return session
+
+    def close(self, name: str) -> None:
+        """A page is gone; what it is waiting for comes to its end first."""
+        with self.lock:
+            session = self.open.pop(name, None)
+            self.heard_of.pop(name, None)
+        if session is not None:
+            with session.lock:
+                session.close()
+
+    def sweep(self) -> None:
+        """Close what has been silent for too long."""
+        with self.lock:
+            late = time.monotonic() - self.idle_seconds
+            silent = [name for name, at in self.heard_of.items() if at < late]
+        for name in silent:
+            self.close(name)
+
+
+def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horizon: int = HORIZON) -> FastAPI:
+    """The application; its open pages are `app.state.sessions`.
+
+    Args:
+        most_pages: that may be open at once.
+        horizon: frames of a film.
+    """
+    sessions = Sessions(lambda link: Session(world_model, world, link, horizon), most_pages)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        async def sweep() -> None:
+            while True:
+                await asyncio.sleep(30)
+                await run_in_threadpool(sessions.sweep)
+
+        sweeping = asyncio.create_task(sweep())
+        yield
+        sweeping.cancel()
+        with suppress(asyncio.CancelledError):
+            await sweeping
+        for name in list(sessions.open):
+            sessions.close(name)
+
+    app = FastAPI(title="textocvp play", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.sessions = sessions
+    page = with_films(files("experiments.play").joinpath("page.html").read_text(encoding="utf-8"))
+
+    @app.middleware("http")
+    async def add_policy(request: Request, answer: Any) -> Response:
+        response: Response = await answer(request)
+        response.headers["Content-Security-Policy"] = POLICY
+        response.headers["Cache-Control"] = "no-store"
+        return response
+
+    def sentence(status: int) -> Callable[[Request, Exception], Response]:
+        def handle(_: Request, error: Exception) -> Response:
+            said = error.args[0] if error.args else type(error).__name__
+            return JSONResponse({"error": str(said)}, status)
+
+        return handle
+
+    for kind in (Refused, ValueError, GroundingError):
+        app.add_exception_handler(kind, sentence(400))
+    app.add_exception_handler(Closed, sentence(410))
+
+    @app.exception_handler(RequestValidationError)
+    def handle_wrong_request(_: Request, error: RequestValidationError) -> Response:
+        parts = [f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in error.errors()]
+        return JSONResponse({"error": "the request is not as it should be: " + "; ".join(parts)}, 422)
+
+    @app.exception_handler(Exception)
+    def handle_bug(_: Request, error: Exception) -> Response:
+        said = f"this went wrong, and should not have: {type(error).__name__}. The terminal says more"
+        return JSONResponse({"error": said}, 500)
+
+    def ask(name: str, what: Callable[[Session], dict[str, Any] | None], view: bool = True) -> dict[str, Any]:
+        """Let a session answer, and add the scene as it is then, and the warnings."""
+        session = sessions.get(name)
+        with session.lock, heard() as warnings:
+            answer = what(session) or {}
+            scene = {"scene": session.view()} if view else {}
+        return {**answer, **scene, "warnings": list(dict.fromkeys(warnings))}
+
+    @app.get("/")
+    def show_page() -> HTMLResponse:
+        return HTMLResponse(page)
+
+    @app.post("/api/open")
+    def open_page(query: Said = "") -> dict[str, Any]:
+        problem = []
+        try:
+            name, session = sessions.add(Link.parse(query))
+        except (Refused, ValueError) as error:
+            name, session = sessions.add(Link())  # says the same once more if there are too many pages
+            problem = [str(error)]
+        about = {"model": repr(world_model), "plans": world_model.model.outcome is not None}
+        about |= {"colors": list(COLORS), "families": list(FAMILIES) if session.base.task.stacks else []}
+        return {"page": name, "about": about, "problems": problem, "scene": session.view()}
+
+    @app.post("/api/{name}/close")
+    def close_page(name: str) -> dict[str, Any]:
+        sessions.close(name)
+        return {}
+
+    @app.post("/api/{name}/alive")
+    def hear_page(name: str) -> dict[str, Any]:
+        sessions.get(name)
+        return {}
+
+    @app.post("/api/{name}/scene")
+    def new_scene(name: str, query: Said) -> dict[str, Any]:
+        return ask(name, lambda session: session.new_scene(Link.parse(query)))
+
+    @app.post("/api/{name}/move")
+    def move(name: str, thing: Annotated[int, Body()], x: Number, y: Number) -> dict[str, Any]:
+        return ask(name, lambda session: session.move(thing, x, y))
+
+    @app.post("/api/{name}/remove")
+    def remove(name: str, thing: Annotated[int, Body(embed=True)]) -> dict[str, Any]:
+        return ask(name, lambda session: session.remove(thing))
+
+    @app.post("/api/{name}/add")
+    def add(name: str, kind: Said, color: Said) -> dict[str, Any]:
+        return ask(name, lambda session: session.add(kind, color))
+
+    @app.post("/api/{name}/imagine")
+    def imagine(name: str, texts: Annotated[list[str], Body(embed=True)]) -> dict[str, Any]:
+        return ask(name, lambda session: {"films": session.imagine(texts)}, view=False)
+
+    @app.post("/api/{name}/do")
+    def do(name: str, text: Said, more: Annotated[bool, Body()] = False) -> dict[str, Any]:
+        return ask(name, lambda session: session.do(text, more))
+
+    @app.post("/api/{name}/goal")
+    def arrange_goal(name: str, what: Said) -> dict[str, Any]:
+        return ask(name, lambda session: session.arrange_goal(what))
+
+    @app.post("/api/{name}/plan")
+    def plan(name: str, text: Said = "") -> dict[str, Any]:
+        return ask(name, lambda session: session.plan(text), view=False)
+
+    @app.post("/api/{name}/picture")
+    async def upload(name: str, request: Request) -> dict[str, Any]:
+        sessions.get(name)
+        data = bytearray()
+        async for part in request.stream():
+            data += part
+            if len(data) > LARGEST_PICTURE:
+                size = int(request.headers.get("content-length", len(data))) / 2**20
+                raise Refused(
+                    f"the picture has {size:.0f} MB; at most {LARGEST_PICTURE // 2**20} MB are taken"
+                )
+        return await run_in_threadpool(ask, name, lambda one: {"done": one.upload(bytes(data))})
+
+    @app.get("/api/{name}/film.{kind}")
+    def download(name: str, kind: str) -> Response:
+        session = sessions.get(name)
+        with session.lock, tempfile.TemporaryDirectory() as folder:
+            session.save(path := Path(folder, f"film.{kind}"))
+            data = path.read_bytes()
+        headers = {"Content-Disposition": f'attachment; filename="imagined.{kind}"'}
+        return Response(data, media_type=MEDIA[kind], headers=headers)
+
+    return app

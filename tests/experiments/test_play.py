@@ -1,0 +1,414 @@
+"""`textocvp play` without a browser: what the page asks for, and every mistake as a sentence."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import socket
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.textocvp.conftest import PLACED, build
+from textocvp import WorldModel, cli
+
+TestClient = pytest.importorskip("fastapi.testclient", exc_type=ImportError).TestClient
+
+from experiments.play import __main__ as command  # noqa: E402
+from experiments.play import server  # noqa: E402
+from experiments.play.links import Link, Refused  # noqa: E402
+from experiments.play.session import WORLDS, heard  # noqa: E402
+
+HORIZON = 24
+OCCUPIED = "seed=0&family=occupied"  # a brown block lies in the cyan bowl
+ASKED = "put the red block in the cyan bowl"
+
+
+@pytest.fixture(scope="module")
+def world_model() -> WorldModel:
+    return WorldModel.from_pretrained()
+
+
+class Page:
+    """An open page, as its script asks."""
+
+    def __init__(self, client: Any, query: str = "") -> None:
+        self.client = client
+        opened = client.post("/api/open", json={"query": query})
+        assert opened.status_code == 200, opened.text
+        self.name, self.opened = opened.json()["page"], opened.json()
+
+    def ask(self, verb: str, **body: Any) -> Any:
+        answer = self.client.post(f"/api/{self.name}/{verb}", json=body)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def refused(self, verb: str, **body: Any) -> str:
+        """The sentence that a wrong wish gets."""
+        answer = self.client.post(f"/api/{self.name}/{verb}", json=body)
+        assert 400 <= answer.status_code < 500 and "Traceback" not in answer.text
+        return answer.json()["error"]
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        return self.client.app.state.sessions.get(self.name).view()
+
+
+@pytest.fixture
+def open_page(world_model: WorldModel) -> Iterator[Callable[..., Page]]:
+    with TestClient(server.create_app(world_model, WORLDS["rearrange"])) as client:
+        yield lambda query="": Page(client, query)
+
+
+def pixels(url: str) -> np.ndarray:
+    """The picture (H, W, 3) of a data URL."""
+    return iio.imread(base64.b64decode(url.removeprefix("data:image/png;base64,")))
+
+
+def test_a_film_shows_what_the_model_imagines(open_page, world_model) -> None:
+    page = open_page(OCCUPIED)
+    texts = [ASKED, "put the red block in the gray bowl"]
+    films = page.ask("imagine", texts=texts)["films"]
+    env = gym.make("RearrangeBlocks-v0", control="primitive")
+    observation, _ = env.reset(seed=0, options={"family": "occupied"})
+    expected = world_model.rollout(observation, texts, horizon=HORIZON, attention=True)
+    assert expected.attention is not None
+    for row, film in enumerate(films):
+        frames = expected.frames[row].permute(0, 2, 3, 1).mul(255).round().byte().numpy()
+        assert np.array_equal(pixels(film["frames"]).reshape(frames.shape), frames)
+        labels = np.repeat(film["runs"][::2], film["runs"][1::2]).reshape(frames.shape[:3])
+        assert np.array_equal(labels, expected.masks[row].argmax(1).numpy())
+        assert film["words"] == texts[row].split()
+        attention = expected.attention[row].mean((1, 2)).numpy() * 100
+        assert np.abs(np.array(film["attention"])[1:] - attention).max() <= 0.51
+        assert {one["name"] for one in film["slots"]} == {
+            "arm", "red block", "brown block", "cyan bowl", "gray bowl", "white bowl", "yellow bowl"
+        }  # fmt: skip
+
+
+def test_an_act_is_shown_beside_what_was_imagined_and_a_link_brings_all_of_it_back(open_page) -> None:
+    page = open_page(OCCUPIED)
+    before = pixels(page.opened["scene"]["picture"])
+    answer = page.ask("do", text="Please place the brown cube into the yellow bowl!")
+    real, imagined = (pixels(answer["film"][name]).reshape(-1, 64, 64, 3) for name in ("real", "frames"))
+    assert np.array_equal(real[0], before) and np.array_equal(real[-1], pixels(answer["scene"]["picture"]))
+    apart = np.abs(real.astype(int) - imagined).mean((1, 2, 3)) / 2.55
+    assert np.abs(apart - answer["film"]["apart_percent"]).max() < 0.051
+    assert np.abs(real[-1].astype(int) - real[0]).max() > 50  # something moved
+    again = open_page(answer["scene"]["link"]).opened["scene"]
+    assert again == answer["scene"]
+    # The same after things were moved, added and removed.
+    white = next(one for one in answer["scene"]["things"] if one["name"] == "white bowl")
+    page.ask("move", thing=white["id"], x=white["at"][0] + 2, y=white["at"][1] + 2)
+    page.ask("remove", thing=next(one["id"] for one in page.scene["things"] if one["name"] == "gray bowl"))
+    scene = page.ask("add", kind="block", color="pink")["scene"]
+    names = {one["name"] for one in scene["things"]}
+    assert "pink block" in names and "gray bowl" not in names
+    assert open_page(scene["link"]).opened["scene"] == scene
+
+
+def test_a_plan_goes_where_the_obvious_sentence_does_not(open_page) -> None:
+    page = open_page(OCCUPIED)
+    plan = page.ask("plan", text=ASKED)
+    assert plan["obvious"]["wrong"] == [
+        "the red block is imagined to end on the brown block, not in the cyan bowl"
+    ]
+    assert plan["reaches"] and len(plan["sentences"]) == len(plan["films"]) == 2
+    chosen = [node for node in plan["tree"] if node["chosen"]]
+    assert [node["text"] for node in chosen] == plan["sentences"] and chosen[-1]["reaches"]
+    # Depths are those of a tree that is written from its root.
+    depths = [node["depth"] for node in plan["tree"]]
+    assert depths[0] == 1 and all(after <= before + 1 for before, after in pairwise(depths))
+    for text in plan["sentences"]:
+        answer = page.ask("do", text=text)
+    assert answer["reached"] == {"seen": True, "true": True}
+    assert page.ask("plan", text=ASKED)["done"]
+
+
+def test_a_goal_is_arranged_and_planned_for(open_page) -> None:
+    page = open_page("seed=3&family=plain")
+    start = page.scene
+    assert page.ask("goal", what="begin")["scene"]["arranging"]
+    at = {one["name"]: one for one in start["things"]}
+    block, bowl = (next(name for name in at if kind in name) for kind in ("block", "bowl"))
+    page.ask("move", thing=at[block]["id"], x=at[bowl]["at"][0], y=at[bowl]["at"][1])
+    assert "being arranged" in page.refused("plan", text="")
+    assert page.ask("goal", what="use")["scene"] == start
+    plan = page.ask("plan", text="")
+    assert plan["obvious"] is None and plan["sentences"] == [f"put the {block} in the {bowl}"]
+    assert page.ask("do", text=plan["sentences"][0])["reached"] == {"seen": True, "true": True}
+
+
+def test_a_bowl_is_moved_with_what_lies_in_it(open_page) -> None:
+    page = open_page(OCCUPIED)
+    names = {one["name"]: one for one in page.scene["things"]}
+    page.ask("remove", thing=names["white bowl"]["id"])
+    before = {one["name"]: np.array(one["at"]) for one in page.scene["things"]}
+    bowl = next(one["id"] for one in page.scene["things"] if one["name"] == "cyan bowl")
+    page.ask("move", thing=bowl, x=22.0, y=20.0)
+    after = {one["name"]: np.array(one["at"]) for one in page.scene["things"]}
+    assert np.abs(after["cyan bowl"] - (22, 20)).max() < 2
+    shift = {name: after[name] - before[name] for name in before}
+    assert np.abs(shift["brown block"] - shift["cyan bowl"]).max() < 1.5
+    assert all(np.abs(shift[name]).max() < 0.2 for name in ("red block", "gray bowl", "yellow bowl"))
+
+
+@pytest.mark.parametrize(
+    ("verb", "body", "said"),
+    [
+        ("scene", {"query": "seed=-1"}, "whole number"),
+        ("scene", {"query": "seed=1e3"}, "whole number"),
+        ("scene", {"query": "seed=" + "9" * 30}, "20 digits"),
+        ("scene", {"query": "family=nothing"}, "plain"),
+        ("scene", {"query": "layout=block,red"}, "damaged"),
+        ("scene", {"query": "layout=block,red,0.5,0,nan,0;bowl,blue,0.4,inf,0,0"}, "workspace"),
+        ("scene", {"query": "acts=1,2,3"}, "damaged"),
+        ("scene", {"query": "acts=1,2,3,nan"}, "damaged"),
+        ("scene", {"query": "acts=" + "0,0,0,0;" * 101}, "at most 100"),
+        ("imagine", {"texts": []}, "1 to 12"),
+        ("imagine", {"texts": ["x y"] * 13}, "1 to 12"),
+        ("imagine", {"texts": [" "]}, "empty"),
+        ("imagine", {"texts": ["do not put the red block in the cyan bowl"]}, "not"),
+        ("imagine", {"texts": [3]}, "string"),
+        ("imagine", {}, "texts"),
+        ("do", {"text": "sing a song"}, "cannot read"),
+        ("do", {"text": "put the blue block in the cyan bowl"}, "no blue block"),
+        ("plan", {"text": ""}, "say what the goal is"),
+        ("plan", {"text": "world peace"}, "cannot read"),
+        ("plan", {"text": "put the blue block in the cyan bowl"}, "no blue block"),
+        ("goal", {"what": "use"}, "no goal is being arranged"),
+        ("move", {"thing": 17, "x": 1, "y": 1}, "no thing number 17"),
+        ("move", {"thing": 0, "x": 1e9, "y": 1}, "workspace"),
+        ("add", {"kind": "block", "color": "red"}, "share a colour"),
+        ("add", {"kind": "cup", "color": "blue"}, "no blue cup"),
+    ],
+)
+def test_a_wrong_wish_gets_a_sentence_and_changes_nothing(open_page, verb, body, said) -> None:
+    page = open_page(OCCUPIED)
+    before = page.scene
+    assert said in page.refused(verb, **body)
+    assert page.scene == before
+
+
+def test_a_wrong_link_is_said_and_another_scene_is_shown(open_page) -> None:
+    opened = open_page("?seed=abc&say=hello").opened
+    assert "not 'abc'" in opened["problems"][0] and opened["scene"]["link"] == "seed=0"
+
+
+def upload(page: Page, data: bytes) -> Any:
+    return page.client.post(f"/api/{page.name}/picture", content=data)
+
+
+def test_a_picture_is_taken_as_the_project_takes_pictures(open_page) -> None:
+    page = open_page(OCCUPIED)
+    large = Image.fromarray(pixels(page.scene["picture"])).resize((128, 128), Image.Resampling.NEAREST)
+    buffer = io.BytesIO()
+    large.save(buffer, "PNG")
+    answer = upload(page, buffer.getvalue()).json()
+    assert answer["done"] == ["brought it from 128x128 to 64x64 pixels"] and not answer["warnings"]
+    assert answer["scene"]["own_picture"] and ASKED in answer["scene"]["sentences"]
+    assert len(page.ask("imagine", texts=[ASKED])["films"]) == 1
+    for verb, body in (
+        ("do", {"text": ASKED}),
+        ("move", {"thing": 0, "x": 3, "y": 3}),
+        ("plan", {"text": ASKED}),
+    ):
+        assert page.refused(verb, **body)
+    noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (90, 60, 3), np.uint8))
+    noise.save(buffer := io.BytesIO(), "JPEG")
+    assert "does not look like those" in upload(page, buffer.getvalue()).json()["warnings"][0]
+    assert not page.ask("scene", query=OCCUPIED)["scene"]["own_picture"]
+
+
+def test_a_wrong_picture_is_refused_in_a_sentence(open_page) -> None:
+    page = open_page(OCCUPIED)
+    before = page.scene
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)).save(
+        buffer := io.BytesIO(), "PNG"
+    )
+    for data, said in (
+        (b"", "no picture"),
+        (b"Dear sir or madam", "no picture"),
+        (buffer.getvalue()[:3000], "no picture"),
+        (bytes(50 * 2**20), "50 MB; at most 20 MB"),
+    ):
+        answer = upload(page, data)
+        assert answer.status_code == 400 and said in answer.json()["error"]
+    assert page.scene == before
+
+
+def test_films_can_be_downloaded(open_page, tmp_path: Path) -> None:
+    page = open_page(OCCUPIED)
+    assert "nothing has been imagined" in page.client.get(f"/api/{page.name}/film.gif").json()["error"]
+    page.ask("imagine", texts=[ASKED])
+    for kind in ("gif", "mp4"):
+        (tmp_path / f"film.{kind}").write_bytes(page.client.get(f"/api/{page.name}/film.{kind}").content)
+        assert len(iio.imread(tmp_path / f"film.{kind}")) == HORIZON + 1
+    sent = page.client.get(f"/api/{page.name}/film.html").text
+    assert ASKED in sent and "red block" in sent
+    # Acts that the page shows beside each other are one film, and one page.
+    for more in (False, True):
+        page.ask("do", text=("put the brown block in the gray bowl", ASKED)[more], more=more)
+    film = iio.imread(page.client.get(f"/api/{page.name}/film.gif").content, extension=".gif")
+    assert len(film) == 2 * (HORIZON + 1) and film.shape[2] > 3 * 256
+    assert page.client.get(f"/api/{page.name}/film.html").text.count('"real"') == 2
+    assert "not '.exe'" in page.client.get(f"/api/{page.name}/film.exe").json()["error"]
+
+
+def test_pages_are_counted_and_closed(world_model) -> None:
+    with TestClient(server.create_app(world_model, WORLDS["tabletop"], most_pages=2)) as client:
+        first, second = Page(client), Page(client)
+        full = client.post("/api/open", json={"query": ""})
+        assert full.status_code == 400 and "--most-pages 2" in full.json()["error"]
+        sessions = client.app.state.sessions
+        env = sessions.get(first.name).env
+        assert client.post(f"/api/{first.name}/close").status_code == 200
+        with pytest.raises(gym.error.ClosedEnvironmentError):
+            env.reset()
+        gone = client.post(f"/api/{first.name}/imagine", json={"texts": [ASKED]})
+        assert gone.status_code == 410 and "load it again" in gone.json()["error"]
+        Page(client)
+        # A tab that vanished without a word.
+        sessions.idle_seconds = 0.0
+        sessions.sweep()
+        assert not sessions.open
+        assert client.post(f"/api/{second.name}/alive").status_code == 410
+        Page(client)
+    assert not sessions.open  # the end of the server closes all
+
+
+def test_one_page_does_not_wait_for_another(open_page, monkeypatch) -> None:
+    slow, quick = open_page(OCCUPIED), open_page("seed=1")
+    session = slow.client.app.state.sessions.get(slow.name)
+    begun, may_end = threading.Event(), threading.Event()
+
+    def imagine(texts: list[str]) -> list[Any]:
+        begun.set()
+        assert may_end.wait(20)
+        warnings.warn("of the slow one", UserWarning, stacklevel=1)
+        return []
+
+    monkeypatch.setattr(session, "imagine", imagine)
+    answers: list[Any] = []
+    thread = threading.Thread(target=lambda: answers.append(slow.ask("imagine", texts=[ASKED])))
+    thread.start()
+    assert begun.wait(20)
+    other = quick.ask("imagine", texts=["put the mauve block in the blue bowl"])
+    may_end.set()
+    thread.join(20)
+    # Neither hears the warnings of the other.
+    assert len(other["films"]) == 1 and answers[0]["warnings"] == ["of the slow one"]
+    assert other["warnings"] and "of the slow one" not in other["warnings"]
+
+
+def test_memory_does_not_grow(world_model) -> None:
+    def resident() -> int:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * 4096
+
+    with TestClient(server.create_app(world_model, WORLDS["rearrange"], horizon=2)) as client:
+        for turn in range(90):
+            if turn == 20:
+                before = resident()
+            page = Page(client, f"seed={turn}")
+            page.ask("imagine", texts=page.opened["scene"]["sentences"][:1])
+            client.post(f"/api/{page.name}/close")
+        assert resident() - before < 8 * 2**20  # after 210 requests
+
+
+def test_a_model_without_foresight_says_so() -> None:
+    tiny = WorldModel(build(PLACED))
+    with TestClient(server.create_app(tiny, WORLDS["tabletop"], horizon=3)) as client:
+        page = Page(client)
+        sentence = page.opened["scene"]["sentences"][0]
+        assert page.ask("imagine", texts=[sentence])["films"][0]["count"] == 4
+        assert "cannot foresee" in page.refused("plan", text=sentence)
+        assert "no families" in page.refused("scene", query="family=plain")
+
+
+def test_links_say_what_they_hold() -> None:
+    link = Link(7, "swap", (("block", "red", 0.5, -0.1, 0.03, 1.5),), ((0.4, 0.0, 0.5, 0.1),))
+    assert Link.parse("?" + link.query() + "&say=put") == link
+    with pytest.raises(Refused):
+        Link.parse("acts=a,b,c,d")
+
+
+def test_the_page_needs_no_other_host(open_page) -> None:
+    answer = open_page().client.get("/")
+    assert not re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r"(?m)^\s*//.*$", "", answer.text))
+    assert "/*film" not in answer.text and "default-src 'self'" in answer.headers["content-security-policy"]
+
+
+def test_warnings_outside_are_not_kept() -> None:
+    with heard() as sentences:
+        warnings.warn("one", UserWarning, stacklevel=1)
+        warnings.warn("one", UserWarning, stacklevel=1)
+    warnings.warn("two", UserWarning, stacklevel=1)
+    assert sentences == ["one", "one"]
+
+
+# ---- the command
+
+
+def test_where_it_cannot_listen_it_says_why(capsys) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        for arguments, said in (
+            (["--port", str(port)], f"port {port}: Address already in use"),
+            (["--port", "70000"], "0 to 65535"),
+            (["--host", "no.such.host.invalid"], "no such address"),
+            (["--most-pages", "0"], "at least 1"),
+            (["--port", "0", "--checkpoint", "nothing"], "nothing"),
+        ):
+            assert command.main(["--no-browser", *arguments]) == 1
+            printed = capsys.readouterr().err
+            assert printed.startswith("textocvp: ") and said in printed and "Traceback" not in printed
+
+
+def test_the_address_says_who_can_reach_it() -> None:
+    assert command.is_loopback("127.0.0.1") and command.is_loopback("::1")
+    assert not command.is_loopback("0.0.0.0") and not command.is_loopback("::")
+
+
+def test_the_command_line_finds_the_page(capsys, monkeypatch) -> None:
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    (target,) = re.findall(r'\[project\.entry-points\."textocvp\.commands"\]\nplay = "(.*)"', text)
+    announced = EntryPoint("play", target, "textocvp.commands")
+    assert announced.load() is command.main
+    monkeypatch.setattr(cli, "entry_points", lambda **_: [announced])
+    assert cli.main(["play", "--no-browser", "--port", "-1"]) == 1
+    assert "0 to 65535" in capsys.readouterr().err
+    monkeypatch.setattr(cli, "entry_points", lambda **_: [])
+    assert cli.main(["play"]) == 1
+    assert "pip install" in capsys.readouterr().err
+
+
+def test_a_rollout_becomes_one_page_to_send(capsys, tmp_path: Path) -> None:
+    env = gym.make("RearrangeBlocks-v0", control="primitive")
+    iio.imwrite(tmp_path / "scene.png", env.reset(seed=0, options={"family": "occupied"})[0]["rgb"])
+    arguments = ["rollout", str(tmp_path / "scene.png"), ASKED, "put the red block in the </script> bowl"]
+    page = tmp_path / "sent" / "what-if.html"
+    assert (
+        cli.main([*arguments, "--horizon", "3", "--out", str(tmp_path / "a.gif"), "--html", str(page)]) == 0
+    )
+    assert str(page) in capsys.readouterr().out
+    text = page.read_text(encoding="utf-8")
+    assert not re.findall(r"(?:src|href)=|https?://", text) and text.count("</script>") == 1
+    (data,) = re.findall(r"const page = (.*);\n", text)
+    films = json.loads(data)["films"]
+    assert [film["count"] for film in films] == [4, 4] and films[0]["words"] == ASKED.split()
+    assert sum(one["name"] != "table" for one in films[0]["slots"]) == 7  # six things and the arm
