@@ -18,13 +18,13 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from envs.checks import check_range
-from envs.dataset import EpisodeConfig, collect, episode_count, record_episodes
-from envs.factors import FACTORS
-from envs.geometry import SIZES
-from envs.physics.camera import PRESETS
-from envs.scenes import SCENES
-from envs.splits import SEEDS_PER_SPLIT, SPLITS
+from .checks import check_range
+from .dataset import EpisodeConfig, collect, episode_count, record_episodes
+from .factors import FACTORS
+from .geometry import SIZES
+from .physics.camera import PRESETS
+from .scenes import SCENES
+from .splits import SEEDS_PER_SPLIT, SPLITS
 
 if TYPE_CHECKING:
     SplitName = str

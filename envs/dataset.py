@@ -23,17 +23,17 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from envs.expert import Expert
-from envs.factors import Factors
-from envs.physics.camera import Camera
-from envs.physics.simulation import LABELS
-from envs.physics.ur5 import PACKAGE, find_package
-from envs.scene import MAX_OBJECTS
-from envs.scenes import Setup, make_setup
-from envs.splits import SPLITS
-from envs.tabletop import Observation, TabletopEnv
-from envs.tasks import TASKS, Question
-from envs.tasks.rearrange import Rearrange, Supports, with_supports
+from .expert import Expert
+from .factors import Factors
+from .physics.camera import Camera
+from .physics.simulation import LABELS
+from .physics.ur5 import PACKAGE, find_package
+from .scene import MAX_OBJECTS
+from .scenes import Setup, make_setup
+from .splits import SPLITS
+from .tabletop import Observation, TabletopEnv
+from .tasks import TASKS, Question
+from .tasks.rearrange import Rearrange, Supports, with_supports
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
