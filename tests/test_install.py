@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,9 @@ def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+needs_pybullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="PyBullet is not installed")
+
+
 @pytest.fixture
 def own_project(tmp_path: Path) -> Path:
     """A project with folders of our names."""
@@ -37,6 +41,7 @@ def own_project(tmp_path: Path) -> Path:
 MAKE = "import gymnasium as gym; env = gym.make('textocvp.envs:PutBlockInBowl-v0', **{})\n"
 
 
+@needs_pybullet
 def test_environments_are_made_and_played_beside_other_folders_of_their_name(own_project: Path) -> None:
     code = MAKE.format({"control": "primitive"}) + (
         "from textocvp.envs import Expert; import copy, pickle, sys, envs\n"
@@ -49,6 +54,7 @@ def test_environments_are_made_and_played_beside_other_folders_of_their_name(own
     assert done.stdout.split() == ["True", "True", "True", "False"], done.stderr
 
 
+@needs_pybullet
 def test_workers_find_the_environments_too(own_project: Path) -> None:
     code = (
         "import gymnasium as gym\n"
@@ -77,6 +83,7 @@ def test_the_planner_is_the_same_under_both_names(own_project: Path) -> None:
     assert theirs and theirs == run(code.format("planning"), ROOT).stdout
 
 
+@needs_pybullet
 def test_both_names_in_one_program_register_once() -> None:
     code = "import envs, warnings; warnings.simplefilter('error'); import textocvp.envs\n" + MAKE.format({})
     done = run(code + "print(env.spec.entry_point)", ROOT)

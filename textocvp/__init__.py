@@ -23,12 +23,14 @@ if not (Path(__file__).parent / "envs").is_dir():  # a checkout, and no wheel
 def __getattr__(name: str) -> Any:
     # Torch is imported when a model is wanted: the processes of an environment do without.
     if name == "Rollout":
-        from textocvp.rollout import Rollout as value
-    elif name == "WorldModel":
-        from textocvp.world_model import WorldModel as value
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return value
+        from textocvp import rollout
+
+        return rollout.Rollout
+    if name == "WorldModel":
+        from textocvp import world_model
+
+        return world_model.WorldModel
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = ["Rollout", "WorldModel"]
