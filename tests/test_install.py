@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from planning import Goal
+
 ROOT = Path(__file__).resolve().parents[1]
 WITHOUT_PYBULLET = "import sys; sys.modules['pybullet'] = None\n"
 
@@ -76,13 +78,6 @@ def test_workers_find_the_environments_too(own_project: Path) -> None:
     assert "2 episodes" in done.stdout, done.stderr
 
 
-def test_the_planner_is_the_same_under_both_names(own_project: Path) -> None:
-    sentence = "put the red block in the blue bowl"
-    code = f"from {{}} import Goal; print(Goal.parse('{sentence}'))"
-    theirs = run(code.format("textocvp.planning"), own_project).stdout
-    assert theirs and theirs == run(code.format("planning"), ROOT).stdout
-
-
 @needs_pybullet
 def test_both_names_in_one_program_register_once() -> None:
     code = "import envs, warnings; warnings.simplefilter('error'); import textocvp.envs\n" + MAKE.format({})
@@ -90,10 +85,15 @@ def test_both_names_in_one_program_register_once() -> None:
     assert done.stdout.strip() == "envs.tabletop:TabletopEnv" and "Warning" not in done.stderr
 
 
-def test_model_and_planner_do_without_pybullet(tmp_path: Path) -> None:
-    code = "import textocvp.cli, textocvp.planning; from textocvp import Rollout, WorldModel; print(WorldModel.rollout)"
-    done = run(WITHOUT_PYBULLET + code, tmp_path)
+def test_model_and_planner_do_without_pybullet_beside_other_folders(own_project: Path) -> None:
+    sentence = "put the red block in the blue bowl"
+    code = (
+        "import textocvp.cli; from textocvp import Rollout, WorldModel; from textocvp.planning import Goal\n"
+        f"print(WorldModel.rollout, Goal.parse('{sentence}'), sep=';')"
+    )
+    done = run(WITHOUT_PYBULLET + code, own_project)
     assert "WorldModel.rollout" in done.stdout, done.stderr
+    assert done.stdout.strip().endswith(f";{Goal.parse(sentence)}")
 
 
 @pytest.mark.parametrize(
