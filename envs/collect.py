@@ -3,7 +3,7 @@
 The expert does what each scene asks. With ``--policy any-sentence`` random sentences are carried out, sensible or
 not, several in a row in scenes with stacks and filled bowls; each is an episode.
 
-The file is the same for any number of workers. A run that was killed, at whatever moment, is resumed by
+The file is the same for any number of workers and any backend. A run that was killed, at whatever moment, is resumed by
 giving the same command again; a finished one is left as it is. docs/data.md describes the file.
 """
 
@@ -18,13 +18,13 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from envs.checks import check_range
-from envs.dataset import EpisodeConfig, collect, episode_count, record_episodes
-from envs.factors import FACTORS
-from envs.geometry import SIZES
-from envs.physics.camera import PRESETS
-from envs.scenes import SCENES
-from envs.splits import SEEDS_PER_SPLIT, SPLITS
+from .checks import check_range
+from .dataset import Backend, EpisodeConfig, collect, episode_count, record_episodes
+from .factors import FACTORS
+from .geometry import SIZES
+from .physics.camera import PRESETS
+from .scenes import SCENES
+from .splits import SEEDS_PER_SPLIT, SPLITS
 
 if TYPE_CHECKING:
     SplitName = str
@@ -58,6 +58,8 @@ class Args:
     """Sentences in a row with any-sentence, by default 8."""
     workers: int = 1
     """Processes."""
+    backend: Backend = "processes"
+    """What runs them: processes of this machine, or the Dask or Ray cluster that the environment names."""
     out: Path | None = None
     """The file to write. Default: data/tabletop-SPLIT.h5 (sentences-SPLIT.h5), or preview-SPLIT.png."""
     image_size: int = 64
@@ -103,7 +105,7 @@ def main(args: Args) -> None:
     else:
         name = "tabletop" if args.policy == "expert" else "sentences"
         out = args.out or Path(f"data/{name}-{args.split}.h5")
-        collect(config, args.episodes, out, args.workers)
+        collect(config, args.episodes, out, args.workers, args.backend)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
 
 

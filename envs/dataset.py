@@ -8,32 +8,33 @@ import os
 import shutil
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, delayed, parallel_config
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from envs.expert import Expert
-from envs.factors import Factors
-from envs.physics.camera import Camera
-from envs.physics.simulation import LABELS
-from envs.physics.ur5 import PACKAGE, find_package
-from envs.scene import MAX_OBJECTS
-from envs.scenes import Setup, make_setup
-from envs.splits import SPLITS
-from envs.tabletop import Observation, TabletopEnv
-from envs.tasks import TASKS, Question
-from envs.tasks.rearrange import Rearrange, Supports, with_supports
+from .expert import Expert
+from .factors import Factors
+from .physics.camera import Camera
+from .physics.simulation import LABELS
+from .physics.ur5 import PACKAGE, find_package
+from .scene import MAX_OBJECTS
+from .scenes import Setup, make_setup
+from .splits import SPLITS
+from .tabletop import Observation, TabletopEnv
+from .tasks import TASKS, Question
+from .tasks.rearrange import Rearrange, Supports, with_supports
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSION = 2
@@ -287,7 +288,7 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
 def _atomically(path: Path, folder: Path) -> Iterator[Path]:
     """A file to write in ``folder``; it takes the name ``path`` when it is whole and on the disk."""
     folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{path.name}.{os.getpid()}.part"
+    part = folder / f"{path.name}.{uuid.uuid4().hex}.part"  # of this machine or another
     yield part
     with open(part, "rb") as file:
         os.fsync(file.fileno())
@@ -380,17 +381,49 @@ def _config_json(config: EpisodeConfig) -> str:
 # -- Many processes, one file ------------------------------------------------------------------------------
 
 
-def collect(config: EpisodeConfig, episodes: int, out: Path, workers: int = 1) -> None:
+Backend = Literal["processes", "dask", "ray"]
+
+
+def collect(
+    config: EpisodeConfig, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes"
+) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 
     Finished pieces wait in ``out``.parts until they are merged into ``out``, in order. Both steps are atomic,
-    so a kill loses no finished piece and doubles none.
+    so a kill loses no finished piece and doubles none. With "dask" or "ray" a cluster makes the pieces (docs/scale.md);
+    all its machines see the folder of ``out`` under the same path.
 
     Raises:
-        ValueError: when ``out`` exists and is something else, or was collected with another configuration.
+        ValueError: when ``out`` exists and is something else, or was collected with another configuration; or when
+            the backend is not installed.
     """
-    with _only_collector(out):
-        _collect(config, episodes, out, workers)
+    with _only_collector(out), _joblib_backend(backend, workers):
+        _collect(config, episodes, out.absolute(), workers, backend)
+
+
+@contextmanager
+def _joblib_backend(backend: Backend, workers: int) -> Iterator[None]:
+    """Let joblib use the cluster that the environment names (or a new one of ``workers`` processes here)."""
+    try:
+        if backend == "processes":
+            cluster: Any = nullcontext()
+        elif backend == "dask":
+            from distributed import Client
+
+            address = os.environ.get("DASK_SCHEDULER_ADDRESS")
+            cluster = Client(address) if address else Client(n_workers=workers, threads_per_worker=1)
+        else:
+            import ray
+            from ray.util.joblib import register_ray
+
+            register_ray()
+            cluster = ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else workers)
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"the backend {backend} is not installed: pip install 'textocvp[{backend}]'"
+        ) from error
+    with cluster, nullcontext() if backend == "processes" else parallel_config(backend):
+        yield
 
 
 @contextmanager
@@ -412,7 +445,7 @@ def _only_collector(out: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int) -> None:
+def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int, backend: Backend) -> None:
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
     step = max(1, EPISODES_PER_PIECE // config.sentences) * config.sentences  # whole scenes
@@ -420,9 +453,11 @@ def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int) -> N
     pieces = [parts / f"{start:07d}-{stop:07d}.h5" for start, stop in ranges]
     waiting: list[Path] = []
     with tqdm(total=episodes, initial=min(done, episodes), unit="episode", desc=config.split) as progress:
-        run = Parallel(n_jobs=workers, return_as="generator", pre_dispatch=2 * workers)
+        # Joblib gets results from Ray at the end only; the pieces are on the disk before.
+        run = Parallel(n_jobs=workers, return_as="list" if backend == "ray" else "generator")
         spans = zip(ranges, pieces, strict=True)
-        jobs = (delayed(_collect_piece)(config, *span, piece, os.getpid()) for span, piece in spans)
+        collector = os.getpid() if backend == "processes" else None
+        jobs = (delayed(_collect_piece)(config, *span, piece, collector) for span, piece in spans)
         for (start, stop), piece, _ in zip(ranges, pieces, run(jobs), strict=True):
             progress.update(stop - start)
             waiting.append(piece)
@@ -437,8 +472,8 @@ def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int) -> N
 
 
 @cache
-def _environment(config: EpisodeConfig) -> TabletopEnv:
-    """One environment for each worker process, whose PyBullet client is used again for each episode."""
+def _environment(config: EpisodeConfig, thread: int) -> TabletopEnv:
+    """One environment for each thread of a worker, whose PyBullet client is used again for each episode."""
     return config.make()
 
 
@@ -455,11 +490,12 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
-def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path, collector: int) -> None:
-    _end_with(collector)
+def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path, collector: int | None) -> None:
+    if collector is not None:
+        _end_with(collector)
     if episode_count(piece, config) == stop - start:
         return
-    env = _environment(config)
+    env = _environment(config, threading.get_ident())
     episodes = list(record_episodes(env, config, range(start, stop)))
     values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
     for name, (dtype, value) in _columns(config).items():

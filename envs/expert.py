@@ -9,12 +9,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.motion import pick_and_place
-from envs.physics.supports import supports
-from envs.scene import GoalPair
-from envs.spaces import primitive_space
-from envs.tabletop import TabletopEnv
-from envs.tasks.rearrange import Rearrange, Supports, arrangement_after
+from .physics.motion import pick_and_place
+from .physics.supports import supports
+from .scene import GoalPair
+from .spaces import primitive_space
+from .tabletop import TabletopEnv
+from .tasks.rearrange import Rearrange, Supports, arrangement_after
 
 
 class Expert:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.checks import check_range
-from envs.colors import COLORS
-from envs.geometry import Box2, Sizes
-from envs.scene import HELD_HEIGHT, MAX_OBJECTS, Scene, Thing
+from .checks import check_range
+from .colors import COLORS
+from .geometry import Box2, Sizes
+from .scene import HELD_HEIGHT, MAX_OBJECTS, Scene, Thing
 
 Range = tuple[float, float]
 

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from envs.checks import check_choice, check_range
-from envs.colors import CAPTION_COLORS
-from envs.factors import read_factors
-from envs.geometry import Point, Sizes
-from envs.physics.arm import Arm, Joints
-from envs.sampling import SceneRequest, arm_jitter
-from envs.scene import Instruction, ObjectSpec, Scene, read_layout
-from envs.scenes import Setup
-from envs.tasks.base import Task
+from .checks import check_choice, check_range
+from .colors import CAPTION_COLORS
+from .factors import read_factors
+from .geometry import Point, Sizes
+from .physics.arm import Arm, Joints
+from .sampling import SceneRequest, arm_jitter
+from .scene import Instruction, ObjectSpec, Scene, read_layout
+from .scenes import Setup
+from .tasks.base import Task
 
 _WITH_LAYOUT = ("color_split", "goal_layout")  # options of random scenes that a layout may have too
 _OF_GOAL = ("family", "goal_layout")

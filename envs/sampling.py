@@ -8,9 +8,9 @@ from math import dist, hypot, pi
 
 import numpy as np
 
-from envs.colors import COLORS, ColorSplit
-from envs.geometry import SPAWN, Box2, Sizes
-from envs.scene import MAX_OBJECTS, TABLE, Instruction, ObjectSpec, Thing
+from .colors import COLORS, ColorSplit
+from .geometry import SPAWN, Box2, Sizes
+from .scene import MAX_OBJECTS, TABLE, Instruction, ObjectSpec, Thing
 
 MAX_BOWLS = 5
 MAX_TRIES = 5000  # whole layouts, 0.3 ms each; the fullest scene needs about 100 (at most 516 in 60 seeds)

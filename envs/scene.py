@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.checks import check_choice
-from envs.colors import COLORS
-from envs.geometry import Box2, Sizes
+from .checks import check_choice
+from .colors import COLORS
+from .geometry import Box2, Sizes
 
 KINDS = ("block", "bowl")
 MAX_OBJECTS = 8  # as many objects as fit side by side into the workspace, each visible

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from envs.checks import check_choice, check_range
-from envs.colors import COLORS, FLOOR_RGB, RGB, ROBOT_RGB, TABLE_RGB, palette
-from envs.factors import NO_FACTORS, SHARES, Factors
-from envs.geometry import SIZES, SPAWN, TABLE, WORKSPACE, Box2, Point, Sizes
-from envs.physics.arm import A2, A3, D1, D4, D5, D6, Arm, Paint
-from envs.physics.camera import PRESETS, CameraPreset
-from envs.scene import MAX_OBJECTS
+from .checks import check_choice, check_range
+from .colors import COLORS, FLOOR_RGB, RGB, ROBOT_RGB, TABLE_RGB, palette
+from .factors import NO_FACTORS, SHARES, Factors
+from .geometry import SIZES, SPAWN, TABLE, WORKSPACE, Box2, Point, Sizes
+from .physics.arm import A2, A3, D1, D4, D5, D6, Arm, Paint
+from .physics.camera import PRESETS, CameraPreset
+from .scene import MAX_OBJECTS
 
 
 @dataclass(frozen=True)

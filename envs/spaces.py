@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.geometry import Box2
-from envs.physics.motion import MAX_SPEED, MAX_TURN
+from .geometry import Box2
+from .physics.motion import MAX_SPEED, MAX_TURN
 
 EXTRAS = ("depth", "segmentation", "proprio")  # observations beside `rgb` and `instruction`, on request
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.colors import ColorSplit
+from .colors import ColorSplit
 
 SEEDS_PER_SPLIT = 10_000_000
 

@@ -11,19 +11,19 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.checks import check_choice, check_range
-from envs.factors import Factors
-from envs.options import OPTIONS, ResetOptions, Scenes, override, read_options, read_scenes, read_seed
-from envs.physics.arm import Joints
-from envs.physics.motion import Action, pick_and_place
-from envs.physics.recorder import Recorder
-from envs.physics.robot import Robot
-from envs.physics.simulation import FIRST_OBJECT, Tabletop
-from envs.physics.supports import supports
-from envs.scene import Scene
-from envs.scenes import Setup, make_setup
-from envs.spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
-from envs.tasks import TASKS, Task
+from .checks import check_choice, check_range
+from .factors import Factors
+from .options import OPTIONS, ResetOptions, Scenes, override, read_options, read_scenes, read_seed
+from .physics.arm import Joints
+from .physics.motion import Action, pick_and_place
+from .physics.recorder import Recorder
+from .physics.robot import Robot
+from .physics.simulation import FIRST_OBJECT, Tabletop
+from .physics.supports import supports
+from .scene import Scene
+from .scenes import Setup, make_setup
+from .spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
+from .tasks import TASKS, Task
 
 Observation = dict[str, Any]
 Control = Literal["primitive", "ee"]

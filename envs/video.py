@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 
 
-class RecordVideo(gym.wrappers.RecordVideo[Any, Any]):
+class RecordVideo(gym.wrappers.RecordVideo):
     """Gymnasium's `RecordVideo`, which keeps one frame of each step, with every frame of a primitive.
 
     The environment is made with ``render_mode="rgb_array_list"``. Needs moviepy.

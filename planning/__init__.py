@@ -15,9 +15,9 @@ Scoring rollouts without a robot:
 Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """
 
-from planning.camera import PinholeCamera
-from planning.controller import Controller, LiteralController, PickAndPlace
-from planning.grounding import (
+from .camera import PinholeCamera
+from .controller import Controller, LiteralController, PickAndPlace
+from .grounding import (
     AppearanceGrounder,
     Grounder,
     Grounding,
@@ -27,9 +27,9 @@ from planning.grounding import (
     ground,
     ground_by_segmentation,
 )
-from planning.language import AnyGoal, Goal, Instruction, PictureGoal, Thing
-from planning.loop import Attempt, EpisodeResult, run_episode
-from planning.planners import (
+from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
+from .loop import Attempt, EpisodeResult, run_episode
+from .planners import (
     BeamPlanner,
     Candidate,
     Imagines,
@@ -40,8 +40,8 @@ from planning.planners import (
     observe,
     watched_frames,
 )
-from planning.relations import RELATIONS, THRESHOLDS, Relation, Thresholds
-from planning.scores import (
+from .relations import RELATIONS, THRESHOLDS, Relation, Thresholds
+from .scores import (
     DEFAULT_CRITERION,
     DEFAULT_SCORE,
     CarryScore,
@@ -54,7 +54,7 @@ from planning.scores import (
     measure_rollout,
     unmet,
 )
-from planning.search import (
+from .search import (
     AnySentencePlanner,
     BelievingPlanner,
     Foresees,

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from planning.camera import PinholeCamera
-from planning.grounding import Grounding
-from planning.language import Instruction, Thing
-from planning.masks import frame_masks
-from planning.relations import RELATIONS
+from .camera import PinholeCamera
+from .grounding import Grounding
+from .language import Instruction, Thing
+from .masks import frame_masks
+from .relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout

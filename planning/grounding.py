@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import linear_sum_assignment
 
-from planning.camera import PinholeCamera
-from planning.language import Instruction, Thing
-from planning.masks import Bools, frame_masks
-from planning.relations import RELATIONS
+from .camera import PinholeCamera
+from .language import Instruction, Thing
+from .masks import Bools, frame_masks
+from .relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.colors import is_color_like
 from numpy.typing import NDArray
 
-from planning.relations import RELATIONS
+from .relations import RELATIONS
 
 
 @dataclass(frozen=True, order=True)

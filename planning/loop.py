@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from planning.camera import PinholeCamera
-from planning.controller import Controller, LiteralController, PickAndPlace
-from planning.grounding import AppearanceGrounder, Grounder, GroundingError
-from planning.language import AnyGoal, Goal, Instruction
-from planning.planners import Plan, Planner
+from .camera import PinholeCamera
+from .controller import Controller, LiteralController, PickAndPlace
+from .grounding import AppearanceGrounder, Grounder, GroundingError
+from .language import AnyGoal, Goal, Instruction
+from .planners import Plan, Planner
 
 if TYPE_CHECKING:
     import gymnasium

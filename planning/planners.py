@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from planning.grounding import Grounder, Grounding, GroundingError
-from planning.language import AnyGoal, Goal, Instruction
-from planning.relations import RELATIONS
-from planning.scores import (
+from .grounding import Grounder, Grounding, GroundingError
+from .language import AnyGoal, Goal, Instruction
+from .relations import RELATIONS
+from .scores import (
     DEFAULT_CRITERION,
     DEFAULT_SCORE,
     Score,

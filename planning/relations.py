@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planning.masks import UNSEEN, Bools, center_inside, centroids
+from .masks import UNSEEN, Bools, center_inside, centroids
 
 
 @dataclass(frozen=True)

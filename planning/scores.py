@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from planning.grounding import Grounding
-from planning.language import Goal, Instruction
-from planning.masks import Bools, contact_distance, frame_masks
-from planning.relations import RELATIONS, THRESHOLDS, Thresholds
+from .grounding import Grounding
+from .language import Goal, Instruction
+from .masks import Bools, contact_distance, frame_masks
+from .relations import RELATIONS, THRESHOLDS, Thresholds
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout

@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from planning.grounding import Grounder, Grounding, GroundingError
-from planning.language import AnyGoal, Goal, Instruction, PictureGoal, Thing
-from planning.planners import Candidate, Imagines, Plan, observe
-from planning.relations import RELATIONS
+from .grounding import Grounder, Grounding, GroundingError
+from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
+from .planners import Candidate, Imagines, Plan, observe
+from .relations import RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout

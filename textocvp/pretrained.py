@@ -114,8 +114,11 @@ def read_model(kind: type[M], folder: Path, **options: Any) -> M:
         name = min(report["missing_keys"])
         raise WeightsError(f"{path} lacks the tensor {name!r} {tuple(model.state_dict()[name].shape)}")
     if report["mismatched_keys"]:
-        name, found, wanted = min(report["mismatched_keys"])
-        raise WeightsError(f"{path} has in shape {tuple(found)} the tensor {name!r} {tuple(wanted)}")
+        name = min(
+            key if isinstance(key, str) else key[0] for key in report["mismatched_keys"]
+        )  # transformers 4, 5
+        wanted = tuple(model.state_dict()[name].shape)
+        raise WeightsError(f"{path} has in another shape the tensor {name!r} {wanted}")
     return model.float()
 
 

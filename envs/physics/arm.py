@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 
-from envs.colors import RGB, ROBOT_RGB
-from envs.geometry import Point
-from envs.physics.shapes import generated_file
-from envs.physics.ur5 import ur5_meshes
+from ..colors import RGB, ROBOT_RGB
+from ..geometry import Point
+from .shapes import generated_file
+from .ur5 import ur5_meshes
 
 Joints = tuple[float, float, float, float, float, float]
 

@@ -8,7 +8,7 @@ from math import cos, radians, sin, tan
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.geometry import Point
+from ..geometry import Point
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from math import dist
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.geometry import Point
-from envs.physics.robot import Robot
+from ..geometry import Point
+from .robot import Robot
 
 Action = NDArray[np.float32]  # (5,): dx, dy, dz in metres, dyaw in radians, suction (on above 0.5)
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.robot import Robot
-from envs.physics.simulation import Image
+from .robot import Robot
+from .simulation import Image
 
 
 class Recorder:

@@ -8,9 +8,9 @@ import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 
-from envs.geometry import Point
-from envs.physics.arm import TIP_LINK, Joints
-from envs.physics.simulation import Tabletop
+from ..geometry import Point
+from .arm import TIP_LINK, Joints
+from .simulation import Tabletop
 
 JOINTS = list(range(6))
 CONTACT = 0.002  # gap in metres at which the suction cup seals, and at which a downward motion stops

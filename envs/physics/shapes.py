@@ -11,7 +11,7 @@ from itertools import pairwise
 from math import cos, hypot, pi, sin
 from pathlib import Path
 
-from envs.geometry import Sizes
+from ..geometry import Sizes
 
 SEGMENTS = 24  # corners of the bowl's circle as seen
 ARC = 5  # bands of a round wall

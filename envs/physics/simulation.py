@@ -17,13 +17,13 @@ from gymnasium import logger
 from gymnasium.error import ClosedEnvironmentError
 from numpy.typing import NDArray
 
-from envs.colors import RGB
-from envs.geometry import BLOCK_MASS, BOWL_MASS, TABLE, Box2, Sizes
-from envs.physics.arm import Joints, arm_urdf
-from envs.physics.camera import Camera
-from envs.physics.shapes import bowl_contact_file, bowl_mesh
-from envs.scene import ObjectSpec, Scene
-from envs.scenes import Setup
+from ..colors import RGB
+from ..geometry import BLOCK_MASS, BOWL_MASS, TABLE, Box2, Sizes
+from ..scene import ObjectSpec, Scene
+from ..scenes import Setup
+from .arm import Joints, arm_urdf
+from .camera import Camera
+from .shapes import bowl_contact_file, bowl_mesh
 
 GRAVITY = -9.8
 TABLE_THICKNESS = 0.04

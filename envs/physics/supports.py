@@ -6,9 +6,9 @@ from math import hypot
 
 import pybullet as p
 
-from envs.physics.robot import CONTACT, Robot
-from envs.physics.simulation import Tabletop
-from envs.scene import NOWHERE, TABLE
+from ..scene import NOWHERE, TABLE
+from .robot import CONTACT, Robot
+from .simulation import Tabletop
 
 UPWARD = 0.7  # height of a unit vector that points up: a contact that carries is less than 45 degrees off
 SETTLED_SPEED = 0.05  # in m/s; a resting block jitters by up to a fifth of this in PyBullet's contact solver

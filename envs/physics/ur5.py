@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from envs.geometry import Point
-from envs.physics.shapes import generated_file
+from ..geometry import Point
+from .shapes import generated_file
 
 PACKAGE = "example-robot-data"
 FOLDER = "cmeel.prefix/share/example-robot-data/robots/ur_description/meshes/ur5/collision"

@@ -1,8 +1,8 @@
 """What may be asked for on the tabletop: one file a task, one line here."""
 
-from envs.tasks.base import Question, Relation, Task
-from envs.tasks.put_in_bowl import In
-from envs.tasks.rearrange import Rearrange
+from .base import Question, Relation, Task
+from .put_in_bowl import In
+from .rearrange import Rearrange
 
 TASKS: dict[str, Task] = {
     "put_block_in_bowl": Task((In(),)),

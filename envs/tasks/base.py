@@ -12,13 +12,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from envs.checks import check_choice
-from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
-from envs.geometry import Sizes
-from envs.physics.robot import Robot
-from envs.physics.simulation import Tabletop
-from envs.sampling import SceneRequest, sample_objects
-from envs.scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
+from ..checks import check_choice
+from ..colors import CAPTION_COLORS, COLORS, ColorSplit
+from ..geometry import Sizes
+from ..physics.robot import Robot
+from ..physics.simulation import Tabletop
+from ..sampling import SceneRequest, sample_objects
+from ..scene import GoalPair, Instruction, ObjectSpec, Scene, Thing
 
 CLIPORT_RADIUS = 0.05  # metres in the plane from its place within which CLIPort calls it success
 

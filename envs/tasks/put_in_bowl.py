@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from envs.physics.robot import Robot
-from envs.physics.simulation import Tabletop
-from envs.physics.supports import SETTLED_SPEED, in_bowl
-from envs.scene import GoalPair, ObjectSpec
-from envs.tasks.base import Relation
+from ..physics.robot import Robot
+from ..physics.simulation import Tabletop
+from ..physics.supports import SETTLED_SPEED, in_bowl
+from ..scene import GoalPair, ObjectSpec
+from .base import Relation
 
 
 class In(Relation):

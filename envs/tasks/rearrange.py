@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.checks import check_choice
-from envs.colors import CAPTION_COLORS, COLORS, ColorSplit
-from envs.geometry import Sizes
-from envs.physics.robot import Robot
-from envs.physics.simulation import Tabletop
-from envs.physics.supports import SETTLED_SPEED, supports
-from envs.sampling import SceneRequest, place_objects
-from envs.scene import TABLE, GoalPair, ObjectSpec, Scene, Thing
-from envs.tasks.base import Question, Relation, Task
-from envs.tasks.put_in_bowl import In
+from ..checks import check_choice
+from ..colors import CAPTION_COLORS, COLORS, ColorSplit
+from ..geometry import Sizes
+from ..physics.robot import Robot
+from ..physics.simulation import Tabletop
+from ..physics.supports import SETTLED_SPEED, supports
+from ..sampling import SceneRequest, place_objects
+from ..scene import TABLE, GoalPair, ObjectSpec, Scene, Thing
+from .base import Question, Relation, Task
+from .put_in_bowl import In
 
 Supports = tuple[int, ...]  # of each object by id: what carries it, see `envs.physics.supports`
 Surprises = Mapping[tuple[Supports, GoalPair], Supports]  # sentences that led elsewhere than they should

@@ -160,3 +160,12 @@ def test_a_window_without_a_display_is_a_warning(monkeypatch: pytest.MonkeyPatch
     with pytest.warns(UserWarning, match="needs a display"):
         env = gym.make("PutBlockInBowl-v0", render_mode="human")
     env.close()
+
+
+def test_a_refused_first_reset_can_be_put_right() -> None:
+    env = gym.make("PutBlockInBowl-v0", control="primitive")
+    with pytest.raises(ValueError, match="n_blocks"):
+        env.reset(seed=0, options={"n_blocks": -1})
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[4]["sim_step"] > 0
+    env.close()

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -232,6 +233,44 @@ def test_two_workers_write_the_same_file(whole: Path, tmp_path: Path) -> None:
     collect(SMALL, 14, tmp_path / "two.h5", workers=2)
     assert contents(tmp_path / "two.h5") == contents(whole)
     assert not (tmp_path / "two.h5.parts").exists()
+
+
+def test_a_dask_cluster_writes_the_same_file_and_a_worker_that_dies_is_replaced(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)  # the cluster's processes are elsewhere
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        victim = next(iter(cluster.workers.values())).pid
+        parts = tmp_path / "cluster.h5.parts"
+
+        def kill_when_it_works() -> None:
+            while not any(parts.glob("*.h5")):
+                time.sleep(0.01)
+            os.kill(victim, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_when_it_works, daemon=True)
+        killer.start()
+        monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", cluster.scheduler_address)
+        collect(SMALL, 14, Path("cluster.h5"), backend="dask")
+        killer.join(timeout=1)
+        assert not killer.is_alive(), "a worker was killed"
+    assert contents(tmp_path / "cluster.h5") == contents(whole)
+    assert [item.name for item in tmp_path.iterdir()] == ["cluster.h5"]
+
+
+def test_ray_writes_the_same_file(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)  # a cluster of two processes here
+    collect(SMALL, 14, tmp_path / "ray.h5", workers=2, backend="ray")
+    assert contents(tmp_path / "ray.h5") == contents(whole)
+
+
+def test_a_backend_that_is_not_installed_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ValueError, match=r"dask is not installed: pip install 'textocvp\[dask\]'"):
+        collect(SMALL, 3, tmp_path / "none.h5", backend="dask")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_finished_file_is_left_alone(whole: Path) -> None:

@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from envs.physics.camera import PRESETS, Camera
 from planning import AppearanceGrounder, Instruction, PinholeCamera, Thing
-from tests.planning.oracle import PALETTE, OracleWorldModel
+from tests.planning.oracle import CAMERA_INFO, PALETTE, OracleWorldModel
 
 torch.set_num_threads(1)  # tiny tensors: more threads only wait for each other
 
@@ -26,8 +25,7 @@ def put_in(block: str, bowl: str) -> Instruction:
 
 @pytest.fixture
 def camera() -> PinholeCamera:
-    close = Camera(PRESETS["close"], 64)
-    return PinholeCamera.from_info({"intrinsics": close.intrinsics, "extrinsics": close.extrinsics})
+    return PinholeCamera.from_info(CAMERA_INFO)
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.colors import palette
 from planning import Instruction, Palette, PinholeCamera
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import Rollout
@@ -26,7 +25,34 @@ LAYERS = {"block": BLOCK, "bowl": BOWL}
 BLOCK_SIZE, BOWL_RADIUS, BOWL_HEIGHT = 0.058, 0.069, 0.046
 HOME = np.array([0.34, 0.0, 0.13])
 
-PALETTE_INFO = palette()  # as in `info["palette"]`
+# `info["camera"]` of the preset "close" with 64 pixels, and `info["palette"]`: constants, because without PyBullet
+# there are no environments to ask. tests/planning/test_camera.py compares them with the real ones.
+CAMERA_INFO = {
+    "intrinsics": [[260.619085695187, 0.0, 32.5], [0.0, 260.619085695187, 31.5], [0.0, 0.0, 1.0]],
+    "extrinsics": [
+        [0.0, 1.0, 0.0, 0.0],
+        [0.8290375725550417, 0.0, -0.5591929034707468, -0.4062284105519705],
+        [-0.5591929034707468, 0.0, -0.8290375725550417, 2.274004522700666],
+        [0.0, 0.0, 0.0, 1.0],
+    ],
+}
+PALETTE_INFO = {
+    "colors": {
+        "blue": (78, 121, 167),
+        "green": (89, 169, 79),
+        "red": (255, 87, 89),
+        "brown": (156, 117, 95),
+        "cyan": (118, 183, 178),
+        "gray": (186, 176, 172),
+        "yellow": (237, 201, 72),
+        "pink": (255, 157, 167),
+        "purple": (176, 122, 161),
+        "white": (255, 255, 255),
+        "orange": (242, 142, 43),
+    },
+    "robot": (105, 72, 240),
+    "table": (47, 47, 47),
+}
 PALETTE = Palette.from_info(PALETTE_INFO)
 COLORS = PALETTE.colors
 

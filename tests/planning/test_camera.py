@@ -1,8 +1,17 @@
 import numpy as np
 import pytest
 
+from envs.colors import palette
 from envs.physics.camera import PRESETS, Camera
 from planning import PinholeCamera
+from tests.planning.oracle import CAMERA_INFO, PALETTE_INFO
+
+
+def test_the_tests_know_camera_and_colours_of_the_environments() -> None:
+    close = Camera(PRESETS["close"], 64)
+    np.testing.assert_allclose(CAMERA_INFO["intrinsics"], close.intrinsics, atol=1e-12)
+    np.testing.assert_allclose(CAMERA_INFO["extrinsics"], close.extrinsics, atol=1e-12)
+    assert palette() == PALETTE_INFO
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))

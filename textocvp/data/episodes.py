@@ -196,7 +196,8 @@ class EpisodeFile(Episodes):
         self._process = -1
         if not self.path.is_file():
             raise FileNotFoundError(
-                f"there is no episode file {self.path}; collect one with: python -m envs.collect --out {self.path}"
+                f"there is no episode file {self.path}; "
+                f"collect one with: python -m textocvp.envs.collect --out {self.path}"
             )
         kept = slice(first)
         try:
@@ -354,7 +355,8 @@ class EpisodeFile(Episodes):
         if version not in FORMAT_VERSIONS:
             raise ValueError(
                 f"{self.path} has format version {version}, and this program reads versions "
-                f"{' and '.join(map(str, FORMAT_VERSIONS))}; collect the episodes again with: python -m envs.collect"
+                f"{' and '.join(map(str, FORMAT_VERSIONS))}; "
+                f"collect the episodes again with: python -m textocvp.envs.collect"
             )
         return int(version)
 

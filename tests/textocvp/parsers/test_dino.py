@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save_file
 from transformers import BitImageProcessor, Dinov2Model
 
 from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
@@ -88,7 +88,7 @@ def test_a_checkpoint_of_a_whole_classifier_in_half_precision_is_read(
     folder: Path, images: np.ndarray
 ) -> None:
     frames, before = to_frames(images[None])[0], encoder(folder)(to_frames(images[None])[0])
-    tensors = load_file(folder / "model.safetensors")
+    tensors = load((folder / "model.safetensors").read_bytes())
     whole = {f"dinov2.{name}": tensor.half() for name, tensor in tensors.items()}
     save_file({**whole, "classifier.weight": torch.zeros(2, 3)}, folder / "model.safetensors")
     after = encoder(folder)(frames)
@@ -109,7 +109,7 @@ def test_nothing_is_made_up_where_weights_are_missing_or_wrong(folder: Path, tmp
         encoder(folder)(torch.zeros(1, 3, 22, 22))
 
     weights, config = folder / "model.safetensors", folder / "config.json"
-    tensors, settings = load_file(weights), json.loads(config.read_text())
+    tensors, settings = load(weights.read_bytes()), json.loads(config.read_text())
     name = "encoder.layer.1.norm1.weight"
     save_file({key: value for key, value in tensors.items() if key != name}, weights)
     with pytest.raises(WeightsError, match=f"lacks the tensor '{name}'"):
