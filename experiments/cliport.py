@@ -34,12 +34,22 @@ from experiments.study.any_size import Seen, drawn, film, fitted, imagine, mask_
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.methods import METHODS, Model, lines
+from experiments.study.methods import HORIZON, METHODS, Method, Model, lines
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, hold_last
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
-from planning import THRESHOLDS, Instruction, PinholeCamera, Thing
+from planning import (
+    THRESHOLDS,
+    BeamPlanner,
+    Goal,
+    Imagines,
+    Instruction,
+    LiteralController,
+    PinholeCamera,
+    Planner,
+    Thing,
+)
 from planning.masks import centroids
 from textocvp.data import open_episodes
 from textocvp.data.cliport import CliportEpisodes
@@ -52,8 +62,29 @@ LENGTHS = {"9 frames": 9, "19 frames": 19}  # the paper's two
 VARIANTS = (*LENGTHS, "episode")
 SENTENCES = ("original", "other bowls")  # the episode's own, and those that name another bowl of the scene
 OWN_SPLITS = {"test": "6 objects", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
-PLAYERS = ("ours", "expert", "random candidate")
 TAUGHT = "ours, taught by masks"
+
+
+def _whole_films(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
+    """These episodes are twice as long as those of the easy scene."""
+    return BeamPlanner(model, horizon=getattr(model, "longest_horizon", None) or HORIZON, seed=seed)
+
+
+PLAYERS: dict[str, Method] = {
+    one.key: one
+    for one in (
+        replace(
+            METHODS["ours"],
+            plan=_whole_films,
+            controller=LiteralController,
+            note="imagine the named block in every bowl, score, act, look; picks and places where things are seen",
+        ),
+        METHODS["no imagination"],
+        METHODS["random candidate"],
+        METHODS["expert"],
+    )
+}
+"""Who acts in the closed loop."""
 
 
 def _paper(label: str, **figures: tuple[float, float]) -> Paper:
@@ -90,6 +121,8 @@ class Args(ScenesArgs):
     """Bundled name, folder, or id on the Hugging Face hub."""
     episodes: Path | None = None
     """Folder of CLIPort's npz files, one of them, or an episode file; without it our own scenes are played."""
+    loops: int = 0
+    """Scenes of each split for the closed loop; 0 for as many as are imagined."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +138,18 @@ class Sizes:
     def of(cls, args: Args) -> Sizes:
         """How much a command line asks for."""
         base, n = cls(4, 2, 2, 1) if args.quick else cls(None, 30, 40, 4), args.scenes
-        return replace(base, episodes=n, scenes=n, loop=n) if n else base
+        base = replace(base, episodes=n, scenes=n, loop=n) if n else base
+        return replace(base, loop=args.loops or base.loop)
+
+
+@dataclass(frozen=True)
+class CliportLoop(LoopEpisode):
+    """A unit of work: one of `PLAYERS`, one scene."""
+
+    @property
+    def acts(self) -> Method:
+        """Who acts."""
+        return PLAYERS[self.method]
 
 
 # --- episodes ---------------------------------------------------------------------------------------------------------
@@ -318,7 +362,7 @@ def units(run: Run) -> dict[str, Part]:
     if cast(Args, run.args).episodes is None:
         own = run.world_model.image_size[0]
         scenes = own_scenes(run, run.sizes.loop, SIDE if SIDE % own == 0 else own)
-        loop = [LoopEpisode(method, scene, seed=seed) for scene in scenes for method in PLAYERS]
+        loop = [CliportLoop(method, scene, seed=seed) for scene in scenes for method in PLAYERS]
         parts["closed loop"] = Part(loop, 10.0)
     return parts
 
@@ -362,8 +406,10 @@ def headline(run: Run) -> dict[str, Key]:
             named[f"{metric}_{n}{ending}"] = (method, ALL, variant, metric)
         named[f"success_original{ending}"] = (method, ALL, "original", "success")
         named[f"success_variants{ending}"] = (method, ALL, "other bowls", "success")
-    for split in OWN_SPLITS:
-        named[f"closed_loop_{split}"] = ("ours", split, "original", "closed_loop_success")
+    for split, (method, ending) in product(
+        OWN_SPLITS, {"ours": "", "no imagination": "_no_imagination"}.items()
+    ):
+        named[f"closed_loop_{split}{ending}"] = (method, split, "original", "closed_loop_success")
     return named
 
 
@@ -390,7 +436,7 @@ MASKS = TableSpec(
 LOOP = TableSpec(
     "Closed loop in our own scenes",
     [Column(title, split, "original", "closed_loop_success") for split, title in OWN_SPLITS.items()],
-    lines(PLAYERS),
+    list(PLAYERS.values()),
     "Judged by the simulator.",
 )
 
