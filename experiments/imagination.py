@@ -431,7 +431,7 @@ def milliseconds(run: Run) -> list[float]:
 
     UsageError if the model cannot do it.
     """
-    if cast(WorldModel, run.world_model).model.outcome is None:
+    if not cast(WorldModel, run.world_model).foresees:
         raise UsageError(
             f"{run.args.checkpoint} cannot foresee outcomes in one step, which this study is about"
         )

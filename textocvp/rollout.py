@@ -223,11 +223,19 @@ class Rollout:
         )
 
     @property
+    def first(self) -> Rollout:
+        """The rollout of only the first frame, from which it was imagined."""
+        return self._only(0)
+
+    @property
     def last(self) -> Rollout:
         """The rollout of only the last frame: where a next instruction would start from."""
-        end, decoded = self.slots.shape[1] - 1, self._decoded
-        kept = ({0: kind[end]} if end in kind else {} for kind in (decoded.masks, decoded.frames))
-        return replace(self, slots=self.slots[:, -1:], attention=None, _decoded=_Decoded(*kept))
+        return self._only(self.slots.shape[1] - 1)
+
+    def _only(self, frame: int) -> Rollout:
+        decoded = self._decoded
+        kept = ({0: kind[frame]} if frame in kind else {} for kind in (decoded.masks, decoded.frames))
+        return replace(self, slots=self.slots[:, frame : frame + 1], attention=None, _decoded=_Decoded(*kept))
 
     def moved(self, positions_BK2: Tensor, texts: Sequence[str]) -> Rollout:
         """Rollouts of two frames: the last one of this (B = 1), and its slots at other places (B, K, 2), in pixels.

@@ -125,6 +125,11 @@ class WorldModel:
             warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=2)
         return self._imagined(self.model.predictor, obs, text, horizon, seed, num_slots, attention)
 
+    @property
+    def foresees(self) -> bool:
+        """Whether the model has a predictor of whole sentences, so that it can `outcome`."""
+        return self.model.outcome is not None
+
     @torch.no_grad()
     def outcome(
         self,

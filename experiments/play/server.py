@@ -168,7 +168,7 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
         except (Refused, ValueError) as error:
             name, session = sessions.add(Link())  # says the same once more if there are too many pages
             problem = [str(error)]
-        about = {"model": repr(world_model), "plans": world_model.model.outcome is not None}
+        about = {"model": repr(world_model), "plans": world_model.foresees}
         about |= {"colors": list(COLORS), "families": list(FAMILIES) if session.base.task.stacks else []}
         return {"page": name, "about": about, "problems": problem, "scene": session.view()}
 

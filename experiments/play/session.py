@@ -369,7 +369,7 @@ class Session:
         goal = Goal.parse(text) if text.strip() else self.goal
         if goal is None:
             raise Refused("say what the goal is, or arrange it")
-        if self.world_model.model.outcome is None:
+        if not self.world_model.foresees:
             raise Refused(
                 f"the checkpoint {self.world_model.checkpoint.name} cannot foresee where sentences lead, which a "
                 "plan is made of; tabletop-small can"

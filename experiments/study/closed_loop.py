@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
+from typing import cast
 
 import numpy as np
 
@@ -13,7 +15,17 @@ from experiments.report.results import EpisodeLine
 from experiments.study.methods import METHODS, Method
 from experiments.study.pool import Worker
 from experiments.study.scenes import SampledScene, StudyScene, place_of, play_expert, sample_scene, scene_hash
-from planning import AppearanceGrounder, EpisodeResult, Goal, SegmentationGrounder, run_episode
+from planning import (
+    AppearanceGrounder,
+    Controller,
+    EpisodeResult,
+    Foresees,
+    Goal,
+    LiteralController,
+    PinholeCamera,
+    SegmentationGrounder,
+    run_episode,
+)
 from textocvp.protocols import LoadModel
 
 
@@ -110,13 +122,16 @@ class LoopEpisode:
         # Seeded by scene and variant too: one stream for all episodes would depend on their order.
         rng = np.random.default_rng([self.seed, self.scene.seed, self.variant or method.chance])
         assert method.plan is not None
+        controller: Callable[[PinholeCamera], Controller | LiteralController] = method.controller
+        if controller is Controller and getattr(world_model, "foresees", False):
+            controller = partial(Controller, outcome=cast(Foresees, world_model).outcome)
         return run_episode(
             worker.environment(self.scene),
             method.plan(world_model, goal, rng, self.seed),
             goal,
             seed=self.scene.seed,
             options=sampled.options(self.variant),
-            controller=method.controller,
+            controller=controller,
             ground=(SegmentationGrounder if method.privileged else AppearanceGrounder).from_info,
             replan=method.replan,
         )

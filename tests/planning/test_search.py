@@ -16,6 +16,7 @@ from planning import (
     RELATIONS,
     AppearanceGrounder,
     BelievingPlanner,
+    Controller,
     Goal,
     GroundingError,
     Instruction,
@@ -197,6 +198,18 @@ def test_the_literal_controller_knows_how_high_things_are(
         np.testing.assert_allclose(action.pick, pick, atol=0.01)
         np.testing.assert_allclose(action.place, place, atol=0.01)
     assert RELATIONS["on"].offset_px[1] < 0, "up in the picture"
+
+
+def test_a_controller_may_trust_the_outcome_more_than_the_film(
+    objects, physics: Physics, camera: PinholeCamera, grounder: AppearanceGrounder
+) -> None:
+    parsed = physics.parse(RGB[None])
+    said = put_in("red", "gray")
+    film, grounding = physics.outcome(parsed, [put_in("red", "blue").text]), grounder(parsed)
+    bowls = {color: Controller(camera, outcome=its).act(film, grounding, said).place
+             for color, its in (("blue", None), ("gray", physics.outcome))}  # fmt: skip
+    np.testing.assert_allclose(bowls["gray"], (0.42, 0.08), atol=0.01)
+    assert np.hypot(*np.subtract(bowls["blue"], bowls["gray"])) > 0.1
 
 
 def test_a_half_hidden_block_is_found_under_the_one_it_carries() -> None:
