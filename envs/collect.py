@@ -19,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from envs.checks import check_range
-from envs.dataset import EpisodeConfig, collect, episode_count, record_episodes
+from envs.dataset import EpisodeConfig, atomically, collect, episode_count, record_episodes
 from envs.factors import FACTORS
 from envs.geometry import SIZES
 from envs.physics.camera import PRESETS
@@ -115,8 +115,8 @@ def save_contact_sheet(config: EpisodeConfig, episodes: int, out: Path) -> None:
         rows = [_contact_row(episode.arrays["frames"]) for episode in played]
     finally:
         env.close()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(out, np.concatenate(rows))
+    with atomically(out, out.parent) as part:
+        iio.imwrite(part, np.concatenate(rows), extension=out.suffix)
 
 
 def _contact_row(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:

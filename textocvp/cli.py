@@ -214,6 +214,10 @@ def _train(arguments: list[str]) -> None:
         train[type(chosen)](chosen)
     except (SettingsError, CacheError, WeightsError) as error:
         raise Mistake(str(error)) from error
+    except OSError as error:
+        if error.errno and error.filename is None:  # those of a full disk have none
+            error.filename = str(chosen.out)
+        raise Mistake(str(error)) from error
 
 
 def _rollout(command: RolloutCommand) -> None:
@@ -250,7 +254,10 @@ def _rollout(command: RolloutCommand) -> None:
         if (read := world_model.model.text.reads(text)) != text:
             print(f"{text!r} is read as {read!r}")
     print(imagined)
-    print(f"wrote {imagined.save(command.out)}")
+    try:
+        print(f"wrote {imagined.save(command.out)}")
+    except OSError as error:
+        raise Mistake(str(error)) from error
 
 
 def _measure(command: MeasureCommand) -> None:
