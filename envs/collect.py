@@ -19,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from .checks import check_range
-from .dataset import Backend, EpisodeConfig, collect, episode_count, record_episodes
+from .dataset import Backend, EpisodeConfig, atomically, collect, episode_count, record_episodes
 from .factors import FACTORS
 from .geometry import SIZES
 from .physics.camera import PRESETS
@@ -117,8 +117,8 @@ def save_contact_sheet(config: EpisodeConfig, episodes: int, out: Path) -> None:
         rows = [_contact_row(episode.arrays["frames"]) for episode in played]
     finally:
         env.close()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(out, np.concatenate(rows))
+    with atomically(out, out.parent) as part:
+        iio.imwrite(part, np.concatenate(rows), extension=out.suffix)
 
 
 def _contact_row(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:

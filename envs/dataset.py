@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import io
 import json
 import os
 import shutil
@@ -271,11 +272,11 @@ def _columns(config: EpisodeConfig) -> _Columns:
 
 def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
     """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment."""
-    with _atomically(path, workshop) as part:
-        if path.exists():
+    with atomically(path, workshop) as part:
+        if exists := path.exists():
             shutil.copyfile(path, part)
-        with h5py.File(part, "a") as file:
-            if "frames" not in file:
+        with _hdf5(part, "r+" if exists else "w") as file:
+            if not exists:
                 _create(file, config)
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
@@ -285,14 +286,53 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
 
 
 @contextmanager
-def _atomically(path: Path, folder: Path) -> Iterator[Path]:
-    """A file to write in ``folder``; it takes the name ``path`` when it is whole and on the disk."""
+def atomically(path: Path, folder: Path) -> Iterator[Path]:
+    """A file to write in ``folder``; it takes the name ``path`` when it is whole and on the disk, else it goes."""
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{path.name}.{uuid.uuid4().hex}.part"  # of this machine or another
-    yield part
-    with open(part, "rb") as file:
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        yield part
+        with open(part, "rb") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)  # on a full disk nothing else makes room
+        raise
+
+
+class _Disk(io.FileIO):
+    """A file that keeps its first error to itself: HDF5 crashes when it cannot write what it closes."""
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while left and self.error is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.error = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+
+@contextmanager
+def _hdf5(path: Path, mode: Literal["w", "r+"]) -> Iterator[h5py.File]:
+    """The file, open to write; an OSError, when it is closed, where there was no room for it."""
+    with _Disk(path, f"{mode[0]}+") as disk:
+        try:
+            with h5py.File(disk, mode) as file:
+                yield file
+        finally:
+            if disk.error is not None:
+                raise OSError(disk.error.errno, disk.error.strerror, str(path)) from disk.error
 
 
 def episode_count(path: Path, config: EpisodeConfig) -> int:
@@ -500,6 +540,6 @@ def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path, co
     values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
     for name, (dtype, value) in _columns(config).items():
         values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
-    with _atomically(piece, piece.parent) as part, h5py.File(part, "w") as file:
+    with atomically(piece, piece.parent) as part, _hdf5(part, "w") as file:
         _create(file, config)
         _append(file, values)

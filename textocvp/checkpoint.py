@@ -8,25 +8,29 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from textocvp.config import ModelConfig
+from textocvp.files import replace_text, replacing
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
+HASH = "weights_sha256"  # in `config.json`: of the file with the weights
 TEXT_FOLDER = "text"  # only where a fine-tuned text encoder needs it
 DEFAULT_CHECKPOINT = "tabletop-small"
+
+M = TypeVar("M", bound=nn.Module)
 
 
 class CheckpointError(ValueError):
@@ -91,11 +95,17 @@ def resolve_checkpoint(name: str | Path, **hub: Any) -> Iterator[Path]:
 
 
 def read_json(folder: Path) -> dict[str, Any]:
-    """What `config.json` of the checkpoint in `folder` holds, whatever its architecture.
+    """The settings in `config.json` of the checkpoint in `folder`, whatever its architecture.
 
     Raises:
         CheckpointError: if there is no readable `config.json` there.
     """
+    settings = _read_config_file(folder)
+    settings.pop(HASH, None)
+    return settings
+
+
+def _read_config_file(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG_FILE
     try:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -130,20 +140,38 @@ def read_config(folder: Path) -> ModelConfig:
         raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
 
 
-def load_weights(model: nn.Module, path: Path) -> None:
-    """Copy every tensor of a safetensors file into the model.
+def load_checkpoint(folder: Path, build_model: Callable[[], M]) -> M:
+    """The model that `build_model` makes, with the weights of the checkpoint in `folder`, in evaluation mode.
+
+    It is first made without memory: sizes that do not fit the weights allocate nothing.
 
     Raises:
-        CheckpointError: if the file is missing or damaged, or its tensors are not exactly the model's in
-            name, shape and kind of number.
+        CheckpointError: if the file is missing or damaged, the tensors are not exactly the model's in name, shape and
+            kind of number, or not those that `config.json` has the hash of; or a ValueError of `build_model`.
     """
     try:
-        found = load_file(path)
+        with torch.device("meta"):
+            wanted = build_model().state_dict()
+        found = _read_weights(folder, wanted)
+        model = build_model()
+    except CheckpointError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
+    model.load_state_dict(found)
+    return model.eval()
+
+
+def _read_weights(folder: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, if they are what is wanted; errors as `load_checkpoint`."""
+    path, stated = folder / WEIGHTS_FILE, _read_config_file(folder).get(HASH)
+    try:
+        content = path.read_bytes()
+        found = load(content)
     except FileNotFoundError:
         raise CheckpointError(f"{path.parent} is no checkpoint: there is no {path.name}") from None
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
-    wanted = model.state_dict()
     if lacking := wanted.keys() - found.keys():
         raise CheckpointError(f"{path} lacks {_listed(sorted(lacking))}")
     if other := found.keys() - wanted.keys():
@@ -152,7 +180,10 @@ def load_weights(model: nn.Module, path: Path) -> None:
         if _kind(found[name]) != _kind(tensor):
             has, needs = _described(found[name]), _described(tensor)
             raise CheckpointError(f"{path}: tensor {name!r} is {has}, the model's is {needs}")
-    model.load_state_dict(found, strict=True)
+    # Checkpoints of the first days have none.
+    if stated is not None and (has := hashlib.sha256(content).hexdigest()) != stated:
+        raise CheckpointError(f"{path} is damaged: its SHA-256 is {has}, and {CONFIG_FILE} says {stated}")
+    return found
 
 
 def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) -> None:
@@ -163,13 +194,8 @@ def write_checkpoint(folder: Path, model: nn.Module, config: Mapping[str, Any]) 
     folder.mkdir(parents=True, exist_ok=True)
     # Copies, because safetensors refuses tensors that share memory, as views of a fused projection do.
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
-    new = folder / f"{WEIGHTS_FILE}.new"
-    try:
-        save_file(tensors, new, metadata={"format": "pt"})
-    except BaseException:
-        new.unlink(missing_ok=True)
-        raise
-    new.replace(folder / WEIGHTS_FILE)
+    with replacing(folder / WEIGHTS_FILE) as new:
+        new.write_bytes(save(tensors, metadata={"format": "pt"}))
     write_config(folder, config)
 
 
@@ -185,15 +211,9 @@ def swap_in(new: Path, folder: Path) -> None:
 
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:
-    """Write `config.json` into `folder`; an old one stays whole until the new one is."""
-    replace_text(folder / CONFIG_FILE, json.dumps(config, indent=2) + "\n")
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file; an old one stays whole until the new one is."""
-    new = path.with_name(path.name + ".new")
-    new.write_text(text, encoding="utf-8")
-    new.replace(path)
+    """Write settings and the hash of the weights there into `config.json`; an old one stays whole until it is."""
+    content = {**config, HASH: hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()}
+    replace_text(folder / CONFIG_FILE, json.dumps(content, indent=2) + "\n")
 
 
 def _kind(tensor: Tensor) -> tuple[torch.Size, bool]:

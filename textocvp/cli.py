@@ -226,6 +226,10 @@ def _train(arguments: list[str]) -> None:
         train[type(chosen)](chosen)
     except (SettingsError, CacheError, WeightsError) as error:
         raise Mistake(str(error)) from error
+    except OSError as error:
+        if error.errno and error.filename is None:  # those of a full disk have none
+            error.filename = str(chosen.out)
+        raise Mistake(str(error)) from error
 
 
 def _play(arguments: list[str]) -> int:
@@ -277,10 +281,13 @@ def _rollout(command: RolloutCommand) -> None:
         if (read := world_model.model.text.reads(text)) != text:
             print(f"{text!r} is read as {read!r}")
     print(imagined)
-    print(f"wrote {imagined.save(command.out)}")
-    if command.html is not None:
-        films = [film_data(imagined, world_model.words(text), row=row) for row, text in enumerate(texts)]
-        print(f"wrote {save_page(command.html, command.image.name, films)}")
+    try:
+        print(f"wrote {imagined.save(command.out)}")
+        if command.html is not None:
+            films = [film_data(imagined, world_model.words(text), row=row) for row, text in enumerate(texts)]
+            print(f"wrote {save_page(command.html, command.image.name, films)}")
+    except OSError as error:
+        raise Mistake(str(error)) from error
 
 
 def _measure(command: MeasureCommand) -> None:

@@ -7,6 +7,7 @@ stores one `ModelConfig` as JSON; `--set part.field=value` changes one on the co
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -22,6 +23,8 @@ from textocvp.text import ENCODERS, TextConfig
 from textocvp.text.words import WordsConfig
 
 C = TypeVar("C")
+
+MOST = 1 << 14  # of any size: more is a slip, and would fill the memory before it is noticed
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,8 @@ def _checked(value: Any, hint: Any, path: str) -> Any:
         return float(value)
     if type(value) is not hint:
         raise ValueError(f"{path} is {value!r}: must be of type {hint.__name__}")
-    if hint is int and value < 1:
-        raise ValueError(f"{path} is {value}: must be at least 1")
+    if hint is int and not 1 <= value <= MOST:
+        raise ValueError(f"{path} is {value}: must be 1 to {MOST}")
+    if hint is float and math.isnan(value):
+        raise ValueError(f"{path} is not a number")
     return value

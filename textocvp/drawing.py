@@ -11,6 +11,8 @@ import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from textocvp.files import replacing
+
 SUFFIXES = (".gif", ".mp4", ".png")
 READABLE = 256  # pixels a side to which a picture in a film is enlarged; one in a strip to half of it
 STRIP_MOMENTS = 12  # the most that a strip shows
@@ -69,16 +71,17 @@ def save_film(
     captions = list(texts) if texts else [""] * B
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    if suffix == ".png":
-        Image.fromarray(_strip(stacked, captions)).save(path)
-        return path
-    film = [_screen(stacked[:, t], captions) for t in range(T)]
-    if suffix == ".gif":
-        imageio.mimsave(path, film, format="GIF", duration=1000 / fps, loop=0)  # type: ignore[arg-type]
-    else:
-        # The video codec halves the colour planes, so both sides must be even.
-        even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in film]
-        imageio.mimsave(path, even, format="FFMPEG", fps=fps, macro_block_size=1)  # type: ignore[arg-type]
+    with replacing(path) as new:
+        if suffix == ".png":
+            Image.fromarray(_strip(stacked, captions)).save(new)
+            return path
+        film = [_screen(stacked[:, t], captions) for t in range(T)]
+        if suffix == ".gif":
+            imageio.mimsave(new, film, format="GIF", duration=1000 / fps, loop=0)  # type: ignore[arg-type]
+        else:
+            # The video codec halves the colour planes, so both sides must be even.
+            even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in film]
+            imageio.mimsave(new, even, format="FFMPEG", fps=fps, macro_block_size=1)  # type: ignore[arg-type]
     return path
 
 

@@ -14,11 +14,9 @@ from huggingface_hub import PyTorchModelHubMixin
 from torch import nn
 
 from textocvp.checkpoint import (
-    CONFIG_FILE,
     TEXT_FOLDER,
-    WEIGHTS_FILE,
-    CheckpointError,
-    load_weights,
+    CheckpointError,  # noqa: F401 - for those who catch what `from_pretrained` raises
+    load_checkpoint,
     read_config,
     resolve_checkpoint,
     swap_in,
@@ -106,12 +104,8 @@ class TextOCVP(
         """
         with resolve_checkpoint(name, **hub) as folder:
             config = read_config(folder)
-            try:
-                model = cls(config, folder / TEXT_FOLDER)
-            except (ValueError, TypeError) as error:
-                raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-            load_weights(model, folder / WEIGHTS_FILE)
-        return model.to(device).eval()
+            model = load_checkpoint(folder, lambda: cls(config, folder / TEXT_FOLDER))
+        return model.to(device)
 
 
 def check_parts(config: ModelConfig) -> None:

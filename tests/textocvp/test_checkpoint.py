@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +49,7 @@ SHA256 = {
     "mage-small": "2b07776f954026e6f0cb92fa9ecf2165e355bf89907f2eb3c5afadc1a4cab8ad",
     "non-oc-small": "055d230cd31d9e0a8cea7bb5df71d21f7d3447667cfabf9ab2e94b24bd1c57ef",
     "ocvp-seq-small": "fbdf969c2da3cbc0d54abec85040dc2ca983c4e9e5de51f7bcb88dcd89d5d3c1",
-    "tabletop-small": "f7b6965d4daaf4b263eb4efde3ec416c7cc10ec4e04081c22aaa310a0ea0482b",
+    "tabletop-small": "18aa70b4474cf023d12c1d6fb4b7c12ae4100453bca3d004371439c02006dc6f",
     "tabletop-small-40": "c661b48b9daa638025ec59c7fb89e1e30e17867b01195002336abe349b5d9961",
 }
 
@@ -56,6 +58,8 @@ SHA256 = {
 def test_a_bundled_checkpoint_is_read_by_its_name(name: str) -> None:
     loaded = load_model(name)
     assert loaded.checkpoint.name == name and loaded.checkpoint.sha256 == SHA256[name]
+    with resolve_checkpoint(name) as folder:
+        assert json.loads((folder / "config.json").read_text())["weights_sha256"] == SHA256[name]
 
 
 @pytest.mark.parametrize("name", [name for name in bundled_checkpoints() if name != "mage-small"])
@@ -116,6 +120,12 @@ def change_config(folder: Path, **changes: object) -> None:
     path.write_text(json.dumps(data))
 
 
+def forget_hash(folder: Path) -> None:
+    data = json.loads((folder / "config.json").read_text())
+    del data["weights_sha256"]
+    (folder / "config.json").write_text(json.dumps(data))
+
+
 def test_an_unknown_config_field_is_named(folder: Path) -> None:
     data = json.loads((folder / "config.json").read_text())
     change_config(folder, predictor={**data["predictor"], "depth": 3})
@@ -147,6 +157,40 @@ def test_figures_of_own_frames_are_checked(folder: Path, value: object, says: st
     change_config(folder, own_frames=value)
     with pytest.raises(CheckpointError, match=rf"config\.json: {says}"):
         TextOCVP.from_pretrained(folder)
+
+
+def test_weights_of_which_a_bit_has_changed_are_refused(folder: Path) -> None:
+    """As after a broken copy: all tensors are there, in their shapes. Without a hash nothing can tell."""
+    path = folder / "model.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=rf"{re.escape(str(path))} is damaged: its SHA-256 is"):
+        TextOCVP.from_pretrained(folder)
+    forget_hash(folder)
+    TextOCVP.from_pretrained(folder)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("parser.num_slots", 10**9, r"parser\.num_slots is 1000000000: must be 1 to 16384"),
+        ("parser.num_slots", 16000, r"parser\.num_slots must be 2 .* to 1000, not 16000"),
+        ("predictor.dim", 16384, r"model\.safetensors: tensor .* the model's is \(.*16384"),
+        ("predictor.layers", 200, r"model\.safetensors lacks tensors"),
+        ("parser.crop_extent", float("nan"), r"parser\.crop_extent is not a number"),
+    ],
+)
+def test_sizes_that_would_fill_the_memory_are_refused_before_they_do(
+    folder: Path, setting: str, value: float, message: str
+) -> None:
+    part, name = setting.split(".")
+    data = json.loads((folder / "config.json").read_text())
+    change_config(folder, **{part: {**data[part], name: value}})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(CheckpointError, match=message):
+        TextOCVP.from_pretrained(folder)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
 
 
 def test_a_checkpoint_without_figures_of_own_frames_loads(folder: Path) -> None:
@@ -210,6 +254,9 @@ def test_a_missing_file_is_named(folder: Path, name: str) -> None:
 def test_half_precision_weights_are_accepted(folder: Path) -> None:
     path = folder / "model.safetensors"
     save_file({name: t.half() if t.is_floating_point() else t for name, t in load_file(path).items()}, path)
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is damaged: its SHA-256 is"):
+        TextOCVP.from_pretrained(folder)
+    forget_hash(folder)
     model = TextOCVP.from_pretrained(folder)
     assert all(p.dtype == torch.float32 for p in model.parameters())
 
@@ -225,7 +272,7 @@ def test_an_old_checkpoint_stays_whole_where_the_new_one_cannot_be_written(
     def full(*args: object, **options: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("textocvp.checkpoint.save_file", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space left"):
         model.save_pretrained(tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

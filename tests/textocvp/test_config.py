@@ -63,7 +63,7 @@ def test_a_kind_is_changed_first_and_keeps_what_both_kinds_have() -> None:
         ("brain.layers=2", "no field 'brain'; known: name, parser"),
         ("predictor.layers=two", "predictor.layers is 'two': must be of type int"),
         ("predictor.layers=2.5", "type int"),
-        ("predictor.layers=0", "predictor.layers is 0: must be at least 1"),
+        ("predictor.layers=0", "predictor.layers is 0: must be 1 to 16384"),
         ("predictor.residual=1", "type bool"),
         ("predictor.attention=both", "attention is 'both': must be one of window, causal"),
         ("predictor.feed_forwards=true", "must be one of 1, 2"),
@@ -103,5 +103,5 @@ def test_a_value_of_json_that_makes_no_sense_is_refused_by_name(
     ("preset_name", "slots"), [("tabletop-small", 1), ("savi-small", 1), ("cliport", 10**9)]
 )
 def test_slot_counts_without_sense_are_refused_before_anything_is_built(preset_name: str, slots: int) -> None:
-    with pytest.raises(ValueError, match=rf"parser\.num_slots must be .* to 1000, not {slots}"):
+    with pytest.raises(ValueError, match=rf"parser\.num_slots .*{slots}"):
         with_settings(preset(preset_name), [f"parser.num_slots={slots}"])

@@ -7,6 +7,7 @@ another network or other episodes than it was made from. Computing goes on where
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Callable
 from functools import cached_property
@@ -21,6 +22,7 @@ from torch import nn
 from tqdm import tqdm
 
 from textocvp.data.episodes import Episodes
+from textocvp.files import replacing
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
 from textocvp.parsers.dino import DinoEncoder
@@ -70,13 +72,13 @@ class FrameCache:
             self.folder.mkdir(parents=True, exist_ok=True)
         for first in tqdm(mine, desc=f"computing {self.folder.name}", unit="part", disable=process > 0):
             values = compute(range(first, min(first + PART, len(self))))
-            path = self._path(first)
-            unfinished = path.with_name(path.name + ".new")
-            with h5py.File(unfinished, "w") as file:
+            # HDF5 crashes on a full disk: it writes to memory.
+            with h5py.File(content := io.BytesIO(), "w") as file:
                 file.attrs.update(self._made_from)
                 rows = max(1, min(len(values), CHUNK // max(1, values[0].nbytes)))
                 file.create_dataset("values", data=values, chunks=(rows, *values.shape[1:]))
-            unfinished.replace(path)  # killed at any moment, either the whole file is there or none
+            with replacing(self._path(first)) as new:
+                new.write_bytes(content.getbuffer())
         return self
 
     def __len__(self) -> int:

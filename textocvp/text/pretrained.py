@@ -149,7 +149,7 @@ class PretrainedEncoder(TextEncoder):
         encoder = build_encoder(
             self._architecture
         )  # also where weights follow: a seed draws the rest as ever
-        if not stored:
+        if not stored and torch.get_default_device().type != "meta":  # where only shapes are asked for
             encoder.load_state_dict(build_encoder(self._architecture, folder).state_dict())
         self.frozen = FrozenStates(encoder) if config.frozen else None
         self.encoder = None if config.frozen else encoder

@@ -15,6 +15,7 @@ from torch import Tensor
 from textocvp.data.cache import FrameCache, cached_features
 from textocvp.data.episodes import Episodes
 from textocvp.data.prefetch import prefetch
+from textocvp.files import replacing
 from textocvp.parsers.base import to_frames
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.training.light import relight
@@ -159,7 +160,8 @@ def save_samples(
         for strip in (frames[times], *redraw(index, to_frames(frames[None], device)[0], times)):
             rows.append(np.concatenate(list(strip), axis=1))
     path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, np.concatenate(rows).repeat(2, 0).repeat(2, 1))
+    with replacing(path) as new:
+        iio.imwrite(new, np.concatenate(rows).repeat(2, 0).repeat(2, 1))
 
 
 def to_pictures(frames_N3HW: Tensor) -> NDArray[np.uint8]:

@@ -32,13 +32,14 @@ from accelerate import (
     InitProcessGroupKwargs,
 )
 from accelerate.state import AcceleratorState
+from safetensors import SafetensorError
 from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import get_cosine_schedule_with_warmup
 
-from textocvp.checkpoint import replace_text
 from textocvp.data import open_episodes
 from textocvp.data.episodes import Episodes
+from textocvp.files import replace_text
 
 STEP_FILE = "step.json"
 SETTINGS_FILE = "settings.json"
@@ -437,10 +438,22 @@ def save_state(accelerator: Accelerator, out: Path, next_step: int) -> None:
     if accelerator.is_main_process:
         shutil.rmtree(new, ignore_errors=True)
     accelerator.wait_for_everyone()
-    accelerator.save_state(str(new))
+    try:
+        accelerator.save_state(str(new))
+        if accelerator.is_main_process:
+            (new / STEP_FILE).write_text(json.dumps({"next_step": next_step}))
+    except (
+        OSError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:  # several libraries write, each fails in its own way
+        shutil.rmtree(new, ignore_errors=True)
+        said = str(error).partition("\n")[0]
+        raise OSError(
+            f"no state can be saved to {state}, is there room on the disk? An old one is kept ({said})"
+        ) from error
     accelerator.wait_for_everyone()
     if accelerator.is_main_process:
-        (new / STEP_FILE).write_text(json.dumps({"next_step": next_step}))
         shutil.rmtree(old, ignore_errors=True)
         if state.exists():
             state.rename(old)

@@ -18,10 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from textocvp.checkpoint import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
     CheckpointError,
-    load_weights,
+    load_checkpoint,
     read_json,
     write_checkpoint,
 )
@@ -273,9 +271,4 @@ def read_checkpoint(folder: Path, architecture: str, build_model: Callable[[dict
     found = data.get("architecture", "textocvp")
     if found != architecture:
         raise CheckpointError(f"{folder} holds a {found!r} model, and this needs one of {architecture!r}")
-    try:
-        model = build_model(data)
-    except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
-    load_weights(model, folder / WEIGHTS_FILE)
-    return model.eval()
+    return load_checkpoint(folder, lambda: build_model(data))
