@@ -48,6 +48,7 @@ from planning import (
     LiteralController,
     PinholeCamera,
     Planner,
+    RandomPlanner,
     Thing,
 )
 from planning.masks import centroids
@@ -67,7 +68,15 @@ TAUGHT = "ours, taught by masks"
 
 def _whole_films(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
     """These episodes are twice as long as those of the easy scene."""
-    return BeamPlanner(model, horizon=getattr(model, "longest_horizon", None) or HORIZON, seed=seed)
+    return BeamPlanner(model, horizon=_longest(model), seed=seed)
+
+
+def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
+    return RandomPlanner(model, rng, depth=1, horizon=_longest(model), seed=seed)
+
+
+def _longest(model: Imagines) -> int:
+    return getattr(model, "longest_horizon", None) or HORIZON
 
 
 PLAYERS: dict[str, Method] = {
@@ -80,7 +89,7 @@ PLAYERS: dict[str, Method] = {
             note="imagine the named block in every bowl, score, act, look; picks and places where things are seen",
         ),
         METHODS["no imagination"],
-        METHODS["random candidate"],
+        replace(METHODS["random candidate"], plan=_random, controller=LiteralController),
         METHODS["expert"],
     )
 }
