@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
+import imageio.v3 as iio
 import torch
 import tyro
 from PIL import UnidentifiedImageError
@@ -127,9 +128,67 @@ class WeightsCommand:
     """Which."""
 
 
+@dataclass
+class DataCommand:
+    """Make an episode file of your own videos, and look at one; `textocvp data --help` says more."""
+
+
+@dataclass
+class ImportCommand:
+    """Make an episode file of a folder of videos, or of folders of pictures, with a sentence each."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder with the videos, and captions.json, captions.csv or captions.txt: name and sentence of each."""
+    out: Path
+    """The episode file."""
+    size: int = 64
+    """Height and width of its frames."""
+    crop: bool = False
+    """Cut off what does not fit a square; otherwise it gets a border."""
+    every: int = 1
+    """Take every so many frames."""
+
+
+@dataclass
+class DescribeCommand:
+    """Say what an episode file holds."""
+
+    file: tyro.conf.Positional[Path]
+    """The file, or a folder of CLIPort's npz files."""
+
+
+@dataclass
+class CheckCommand:
+    """Say what is wrong in an episode file; exit status 1 if anything is."""
+
+    file: tyro.conf.Positional[Path]
+    """The file, or a folder of CLIPort's npz files."""
+    window: int | None = None
+    """Frames that the predictor to be trained looks ahead (24 by default there)."""
+
+
+@dataclass
+class PreviewCommand:
+    """Draw moments of the first episodes, a row each, and print their sentences."""
+
+    file: tyro.conf.Positional[Path]
+    """The file, or a folder of CLIPort's npz files."""
+    out: Path = Path("preview.png")
+    """Where to."""
+
+
+DataAction = Union[  # noqa: UP007
+    Annotated[ImportCommand, tyro.conf.subcommand("import")],
+    Annotated[DescribeCommand, tyro.conf.subcommand("info")],
+    Annotated[CheckCommand, tyro.conf.subcommand("check")],
+    Annotated[PreviewCommand, tyro.conf.subcommand("preview")],
+]
+
+
 Command = Union[  # noqa: UP007 - tyro reads it at run time, also on Python 3.10
     Annotated[TrainCommand, tyro.conf.subcommand("train")],
     Annotated[RolloutCommand, tyro.conf.subcommand("rollout")],
+    Annotated[DataCommand, tyro.conf.subcommand("data")],
     Annotated[PlayCommand, tyro.conf.subcommand("play")],
     Annotated[ModelsCommand, tyro.conf.subcommand("models")],
     Annotated[InfoCommand, tyro.conf.subcommand("info")],
@@ -146,6 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             if arguments[:1] == ["play"]:
                 return _play(arguments[1:])
+            if arguments[:1] == ["data"]:
+                return _data(arguments[1:])
             _run(arguments)
     except (Mistake, CheckpointError) as error:
         print(f"textocvp: {error}", file=sys.stderr)
@@ -230,6 +291,37 @@ def _train(arguments: list[str]) -> None:
         if error.errno and error.filename is None:  # those of a full disk have none
             error.filename = str(chosen.out)
         raise Mistake(str(error)) from error
+
+
+def _data(arguments: list[str]) -> int:
+    from textocvp.data import open_episodes, own_videos
+
+    action: Any = tyro.cli(
+        DataAction, prog="textocvp data", description="Episode files of your own videos.", args=arguments
+    )
+    try:
+        if isinstance(action, ImportCommand):
+            done = own_videos.import_videos(
+                action.source, action.out, size=action.size, crop=action.crop, every=action.every
+            )
+            for line in done.left_out:
+                print(f"left out: {line}", file=sys.stderr)
+            print(f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames")
+            return 0
+        with open_episodes(action.file) as episodes:
+            if isinstance(action, CheckCommand):
+                found = own_videos.problems(episodes, action.window)
+                print("\n".join(found) or "nothing is wrong")
+                return 1 if found else 0
+            print("\n".join(own_videos.describe(episodes)))
+            if isinstance(action, PreviewCommand):
+                iio.imwrite(action.out, own_videos.contact_sheet(episodes))
+                for index, text in enumerate(episodes.instructions[: own_videos.SHOWN]):
+                    print(f"row {index}: {text}")
+                print(f"wrote {action.out}")
+    except (OSError, ValueError) as error:
+        raise Mistake(str(error)) from error
+    return 0
 
 
 def _play(arguments: list[str]) -> int:
