@@ -317,7 +317,7 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
             round(time.monotonic() - began, 1),
             rows,
             this.headline(rows),
-            [line for part in found.values() for one in part for line in getattr(one, "lines", ())],
+            tuple(line for part in found.values() for one in part for line in getattr(one, "lines", ())),
         )
         _write(this, results, found, manifest)
         done = True
