@@ -288,17 +288,21 @@ def warn_of_absent(
     off_BLK = (seen_B1K3 - light_BLK1.clamp(*LIGHT) * named_BL13).norm(dim=-1)
     off_BLK = off_BLK.masked_fill(~state.is_thing[:, None, :, 0], torch.inf)
     absent_BL = words.names_color_BL & (off_BLK.amin(-1) > ABSENT)
-    for b, position in absent_BL.nonzero()[:1].tolist():
-        things = off_BLK[b, position].isfinite()
+    for b, position in absent_BL.nonzero().tolist():
+        word, things = encoder.words(texts[b])[position], off_BLK[b, position].isfinite()
         slots_2 = off_BLK[b, position].argsort()[: min(2, int(things.sum()))]
         colors_23 = seen_B1K3[b if len(slots_BKD) > 1 else 0, 0, slots_2].cpu().tolist()
-        nearest = " and ".join(dict.fromkeys(repr(encoder.color_name(color)) for color in colors_23))
+        names = dict.fromkeys(encoder.color_name(color) for color in colors_23)
+        if word in names:  # in an odd light
+            continue
+        nearest = " and ".join(map(repr, names)) or "nothing"
         warnings.warn(
-            f"nothing seen is {encoder.words(texts[b])[position]!r}; the nearest is {nearest or 'nothing'}. What is "
+            f"nothing seen is {word!r}; the nearest is {nearest}. What is "
             f"imagined of {texts[b]!r} may be another thing's motion",
             UserWarning,
             stacklevel=depth + 1,
         )
+        return
 
 
 def checked_seed(seed: int) -> int:

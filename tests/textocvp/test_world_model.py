@@ -13,6 +13,7 @@ import torch
 from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from textocvp import Rollout, WorldModel
 from textocvp.checkpoint import CheckpointError
+from textocvp.inputs import ForeignPictureWarning
 from textocvp.model import TextOCVP
 from textocvp.presets import PRESETS
 from textocvp.world_model import bundled_checkpoints
@@ -211,6 +212,18 @@ def test_a_thing_that_nothing_answers_to_is_a_warning_that_names_the_nearest(
         placed_world_model.rollout(scene, text, horizon=1, num_slots=2)  # which do not show everything
     with pytest.warns(UserWarning, match="nothing seen is 'purple'"):
         placed_world_model.rollout(placed_world_model.parse(scene[None]), "put the purple block", horizon=1)
+
+
+def test_a_thing_in_an_odd_light_is_not_called_absent(placed_world_model, scene) -> None:
+    """It is farther from its name's colour than the threshold, and would still be called by no other name."""
+    burnt = scene.copy()
+    red = (scene[..., 0] > 1.5 * scene[..., 1]) & (scene[..., 0] > 1.5 * scene[..., 2])
+    assert red.sum() > 20
+    burnt[red] = (255, 64, 64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", category=ForeignPictureWarning)
+        placed_world_model.rollout(burnt, TEXT, horizon=1)
 
 
 @pytest.mark.parametrize("seed", [None, -1, 2**64, 1.0, True, "0"])
