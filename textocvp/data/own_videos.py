@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,9 +58,10 @@ def read_captions(folder: Path) -> dict[str, str]:
         if path.suffix == ".json":
             found = json.loads(text)
         elif path.suffix == ".csv":
-            found = {row[0]: row[1] for row in csv.reader(text.splitlines()) if row}
+            found = {row[0]: ",".join(row[1:]) for row in csv.reader(text.splitlines()) if row}
         else:
-            found = dict(line.split(maxsplit=1) for line in text.splitlines() if line.strip())
+            lines = [line.strip() for line in text.splitlines() if line.strip()]
+            found = dict(line.split("\t" if "\t" in line else None, maxsplit=1) for line in lines)
         if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
             raise ValueError("it must hold a sentence for each name")
     except (ValueError, IndexError) as error:
@@ -111,6 +113,8 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
             frames[-len(video) :] = video
             lengths.append(len(video))
             sentences.append(sentence)
+        known = {name for path in videos for name in (path.name, path.stem)}
+        done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
         if not lengths:
             raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
         file.attrs.update({"format": "textocvp-episodes", "format_version": 2})
@@ -123,13 +127,22 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
 
 def _read_video(path: Path, size: int, crop: bool, every: int) -> NDArray[np.uint8]:
     if path.is_dir():
-        files = sorted(one for one in path.iterdir() if one.suffix.lower() in PICTURES)[::every]
+        files = sorted((one for one in path.iterdir() if one.suffix.lower() in PICTURES), key=_by_number)[
+            ::every
+        ]
         shots = [read_picture(one, (size, size), resize=not crop, crop=crop)[0] for one in files]
         return np.stack(shots) if shots else np.zeros((0, size, size, 3), np.uint8)
     fit = ImageOps.fit if crop else ImageOps.pad
     frames = (frame for i, frame in enumerate(_frames(path)) if i % every == 0)
     pictures = [np.asarray(fit(Image.fromarray(frame).convert("RGB"), (size, size))) for frame in frames]
     return np.stack(pictures) if pictures else np.zeros((0, size, size, 3), np.uint8)
+
+
+def _by_number(path: Path) -> list[tuple[bool, int, str]]:
+    """Sorts 2 before 10, whatever stands around the numbers."""
+    return [
+        (part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", path.name)
+    ]
 
 
 def _frames(path: Path) -> Iterator[NDArray[np.uint8]]:

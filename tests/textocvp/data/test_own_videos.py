@@ -42,7 +42,7 @@ def fill(folder: Path, count: int = 4) -> Path:
         else:
             (folder / name).mkdir()
             for t, frame in enumerate(video(i)):
-                iio.imwrite(folder / name / f"{t:03}.png", frame)
+                iio.imwrite(folder / name / f"frame_{t}.png", frame)  # of 12: by number, not by letter
         rows.append((name, SENTENCES[i % 2]))
     with open(folder / "captions.csv", "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows(rows)
@@ -72,6 +72,10 @@ def test_captions_of_every_kind(tmp_path: Path) -> None:
     wanted = {"a.mp4": "put it there", "b": "and back"}
     (tmp_path / "captions.txt").write_text("a.mp4\tput it  there\nb and back\n")
     assert read_captions(tmp_path) == wanted
+    (tmp_path / "captions.txt").write_text("b c.mp4\tput it there\n")
+    assert read_captions(tmp_path) == {"b c.mp4": "put it there"}
+    (tmp_path / "captions.csv").write_text("a,put the red block, then the green one, there\n")
+    assert read_captions(tmp_path) == {"a": "put the red block, then the green one, there"}
     (tmp_path / "captions.json").write_text(json.dumps(wanted))
     assert read_captions(tmp_path) == wanted
     (tmp_path / "captions.json").write_text('{"a": 3}')
@@ -84,10 +88,10 @@ def test_what_cannot_be_used_is_named_and_nothing_half_written_stays(tmp_path: P
     (folder / "broken.mp4").write_bytes(b"no video")
     (folder / "silent").mkdir()
     captions = folder / "captions.csv"
-    captions.write_text(captions.read_text() + "broken.mp4,put it there\n")
+    captions.write_text(captions.read_text() + "broken.mp4,put it there\nnone,put it there\n")
     done = import_videos(folder, out, size=32, every=2)
     assert done.episodes == 4 and done.frames == 24
-    assert [line.split(":")[0] for line in done.left_out] == ["broken.mp4", "silent"]
+    assert [line.split(":")[0] for line in done.left_out] == ["broken.mp4", "silent", "none"]
     assert "6 frames; the predictor looks 3 ahead" in problems(open_episodes(out), window=3)[0]
     before = out.read_bytes()
     captions.write_text("broken.mp4,put it there\n")
