@@ -1,5 +1,7 @@
 """Collect episodes into an HDF5 file: ``python -m envs.collect --split train --episodes 10000 --out F``.
 
+``--world cater`` draws clips of CATER-hard instead of the robot's tabletop.
+
 The expert does what each scene asks. With ``--policy any-sentence`` random sentences are carried out, sensible or
 not, several in a row in scenes with stacks and filled bowls; each is an episode.
 
@@ -9,7 +11,7 @@ giving the same command again; a finished one is left as it is. docs/data.md des
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -18,8 +20,9 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from .cater.record import Captions, CaterConfig
 from .checks import check_range
-from .dataset import Backend, EpisodeConfig, atomically, collect, episode_count, record_episodes
+from .dataset import Backend, EpisodeConfig, World, atomically, collect, episode_count
 from .factors import FACTORS
 from .geometry import SIZES
 from .physics.camera import PRESETS
@@ -40,6 +43,9 @@ else:
     FactorName = tyro.extras.literal_type_from_choices(FACTORS)
 
 SENTENCES = 8  # of a scene
+TABLETOP_ONLY = ("policy", "sentences_per_scene", "scene", "camera", "sizes", "without")
+CATER_ONLY = ("captions",)
+CATER_SPLITS = ("train", "val", "test")
 COLUMNS = 9  # frames of an episode on a contact sheet
 PIXELS, GAP = 128, 4  # height of a row, and the space between its frames
 
@@ -48,6 +54,8 @@ PIXELS, GAP = 128, 4  # height of a row, and the space between its frames
 class Args:
     """Collect episodes into an HDF5 file, or show what they look like."""
 
+    world: Literal["tabletop", "cater"] = "tabletop"
+    """The robot's tabletop, or CATER-hard, which has no robot and takes only split, sizes of the file and captions."""
     split: SplitName = "train"
     """Which scenes; the splits' seeds are disjoint."""
     episodes: int = 100
@@ -72,6 +80,8 @@ class Args:
     """Of blocks and bowls: the paper's or CLIPort's own; by default the scene's."""
     without: tuple[FactorName, ...] = ()
     """Factors of the scene to leave out."""
+    captions: Captions = "explicit"
+    """Of CATER-hard: with every attribute and the cell, or with some attributes and the quadrant."""
     preview: bool = False
     """Write a contact sheet PNG of the first episodes instead."""
 
@@ -82,38 +92,52 @@ class Args:
             check_range("--sentences-per-scene", self.sentences_per_scene, 1, None, whole=True)
             if self.policy == "expert":
                 raise ValueError("--sentences-per-scene needs --policy any-sentence; the expert plays one")
+        other = CATER_ONLY if self.world == "tabletop" else TABLETOP_ONLY
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in other:
+            if getattr(self, name) != defaults[name]:
+                raise ValueError(f"--{name.replace('_', '-')} is not for --world {self.world}")
+        if self.world == "cater" and self.split not in CATER_SPLITS:
+            raise ValueError(
+                f"--split of --world cater is one of {', '.join(CATER_SPLITS)}, not {self.split}"
+            )
 
 
 def main(args: Args) -> None:
     """Run the command line."""
-    factors = SCENES[args.scene].factors.without(args.without)
-    sentences = 1 if args.policy == "expert" else args.sentences_per_scene or SENTENCES
-    config = EpisodeConfig(
-        args.split,
-        args.scene,
-        args.image_size,
-        args.camera,
-        args.sizes,
-        factors=factors,
-        policy=args.policy,
-        sentences=sentences,
-    )
+    config = configuration(args)
     if args.preview:
         out = args.out or Path(f"preview-{args.split}.png")
         save_contact_sheet(config, min(args.episodes, 8), out)
         print(f"wrote {out}")
     else:
-        name = "tabletop" if args.policy == "expert" else "sentences"
+        name = args.world if args.policy == "expert" else "sentences"
         out = args.out or Path(f"data/{name}-{args.split}.h5")
         collect(config, args.episodes, out, args.workers, args.backend)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
 
 
-def save_contact_sheet(config: EpisodeConfig, episodes: int, out: Path) -> None:
+def configuration(args: Args) -> World:
+    """What decides the content of the episodes."""
+    if args.world == "cater":
+        return CaterConfig(args.split, args.image_size, args.captions)
+    return EpisodeConfig(
+        args.split,
+        args.scene,
+        args.image_size,
+        args.camera,
+        args.sizes,
+        factors=SCENES[args.scene].factors.without(args.without),
+        policy=args.policy,
+        sentences=1 if args.policy == "expert" else args.sentences_per_scene or SENTENCES,
+    )
+
+
+def save_contact_sheet(config: World, episodes: int, out: Path) -> None:
     """Write a PNG with one row for each episode: frames evenly spread from the first to the last."""
     env = config.make()
     try:
-        played = record_episodes(env, config, range(episodes))
+        played = config.record(env, range(episodes))
         rows = [_contact_row(episode.arrays["frames"]) for episode in played]
     finally:
         env.close()

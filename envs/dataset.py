@@ -17,7 +17,7 @@ from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import h5py
 import numpy as np
@@ -46,12 +46,55 @@ EPISODES_PER_MERGE = 500
 FRAMES_PER_CHUNK = 4  # a clip of 6 frames touches two or three; larger ones unpack more that is thrown away
 
 
+class World(Protocol):
+    """What decides, beside the number, the content of an episode: `EpisodeConfig`, or another world's.
+
+    Hashable, picklable. A new world writes this and adds itself to `envs.collect`.
+    """
+
+    @property
+    def split(self) -> str:
+        """A name of `SPLITS`."""
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of frames, in pixels."""
+
+    @property
+    def sentences(self) -> int:
+        """How many episodes in a row are made together."""
+
+    @property
+    def arrays(self) -> dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]]:
+        """The data sets over frames, of `ARRAYS` or like them."""
+
+    @property
+    def columns(self) -> Columns:
+        """The data sets over episodes: name -> type, and value of what `record` yields."""
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Of the file, beside format, split and configuration."""
+
+    def __hash__(self) -> int:
+        """Of all that is in it."""
+
+    def to_json(self) -> str:
+        """By which files are compared."""
+
+    def make(self) -> Any:
+        """What `record` needs, made once in every process."""
+
+    def record(self, env: Any, numbers: range) -> Iterator[Any]:
+        """Episodes of the split, each with `arrays`; a function of the configuration and the numbers alone."""
+
+
 # -- One episode -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """What, beside the seed, decides the content of an episode."""
+    """What, beside the seed, decides the content of an episode of the tabletop."""
 
     split: str
     scene: str = "simple"
@@ -89,6 +132,42 @@ class EpisodeConfig:
     def setup(self) -> Setup:
         """What is alike in all scenes."""
         return make_setup(self.scene, self.camera, self.sizes, self.factors, self.object_scale)
+
+    def record(self, env: TabletopEnv, numbers: range) -> Iterator[RecordedEpisode]:
+        """See `record_episodes`."""
+        return record_episodes(env, self, numbers)
+
+    @property
+    def arrays(self) -> dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]]:
+        """The data sets over frames."""
+        return ARRAYS
+
+    @property
+    def columns(self) -> Columns:
+        """The data sets over episodes."""
+        return _COLUMNS if self.policy == "expert" else _COLUMNS | _SENTENCE_COLUMNS
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The file's attributes, beside its format and configuration."""
+        setup, ur5 = self.setup, find_package()
+        camera = Camera(setup.camera, self.image_size, setup.oversampling)
+        return {
+            "versions": json.dumps(
+                versions("pybullet", "gymnasium", "numpy", "h5py") | {PACKAGE: ur5.version if ur5 else None}
+            ),
+            "vocabulary": json.dumps(TASKS[self.task].vocabulary),
+            "labels": json.dumps(LABELS),
+            "camera_intrinsics": camera.intrinsics,
+            "camera_extrinsics": camera.extrinsics,
+        }
+
+    def to_json(self) -> str:
+        """The configuration, by which files are compared."""
+        values = asdict(self) | {"factors": asdict(self.setup.factors)}
+        if self.policy == "expert":  # as in files that are older than other policies
+            del values["policy"], values["sentences"]
+        return json.dumps(values)
 
 
 @dataclass(frozen=True)
@@ -236,7 +315,7 @@ SIDE = -1  # stands for the image size in the shapes below
 _IMAGE = {"compression": "gzip", "compression_opts": 1}
 _POSE = {"compression": "lzf"}
 # Name -> shape of a frame's value, type, frames in a chunk, compression.
-_ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
+ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "frames": ((SIDE, SIDE, 3), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "segmentation": ((SIDE, SIDE), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "arm": ((6,), "f4", 256, {}),
@@ -244,33 +323,34 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "object_position": ((MAX_OBJECTS, 3), "f4", 256, _POSE),
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
-_TEXT = h5py.string_dtype()
-_Columns = dict[str, tuple[Any, Callable[[RecordedEpisode], Any]]]
+TEXT = h5py.string_dtype()
+Columns = dict[str, tuple[Any, Callable[[Any], Any]]]
 # Name -> type and value of an episode; where it starts is known when it is written.
-_COLUMNS: _Columns = {
+_COLUMNS: Columns = {
     "length": ("i8", lambda episode: len(episode.arrays["frames"])),
     "seed": ("i8", lambda episode: episode.seed),
-    "instruction": (_TEXT, lambda episode: episode.instruction),
-    "objects": (_TEXT, lambda episode: json.dumps(episode.objects)),
-    "questions": (_TEXT, lambda episode: json.dumps([each._asdict() for each in episode.questions])),
-    "factors": (_TEXT, lambda episode: json.dumps(episode.factors)),
-    "options": (_TEXT, lambda episode: json.dumps(episode.options)),
+    "instruction": (TEXT, lambda episode: episode.instruction),
+    "objects": (TEXT, lambda episode: json.dumps(episode.objects)),
+    "questions": (TEXT, lambda episode: json.dumps([each._asdict() for each in episode.questions])),
+    "factors": (TEXT, lambda episode: json.dumps(episode.factors)),
+    "options": (TEXT, lambda episode: json.dumps(episode.options)),
     "success": ("?", lambda episode: episode.success),
 }
 _SUPPORTS = np.dtype(("i1", (MAX_OBJECTS,)))
 # Those that files of "any-sentence" have besides.
-_SENTENCE_COLUMNS: _Columns = {
+_SENTENCE_COLUMNS: Columns = {
     "sentence": ("i8", lambda episode: episode.sentence),
     "supports_before": (_SUPPORTS, lambda episode: _padded_supports(episode.supports[0])),
     "supports_after": (_SUPPORTS, lambda episode: _padded_supports(episode.supports[1])),
 }
 
 
-def _columns(config: EpisodeConfig) -> _Columns:
-    return _COLUMNS if config.policy == "expert" else _COLUMNS | _SENTENCE_COLUMNS
+def versions(*packages: str) -> dict[str, str | None]:
+    """The versions of what made a file."""
+    return {name: version(name) for name in packages}
 
 
-def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: Path) -> None:
+def merge(path: Path, config: World, pieces: Iterable[Path], workshop: Path) -> None:
     """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment."""
     with atomically(path, workshop) as part:
         if exists := path.exists():
@@ -280,7 +360,7 @@ def merge(path: Path, config: EpisodeConfig, pieces: Iterable[Path], workshop: P
                 _create(file, config)
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
-                    names = [*_ARRAYS, *(f"episode/{name}" for name in _columns(config))]
+                    names = [*config.arrays, *(f"episode/{name}" for name in config.columns)]
                     # A file that was begun before there were `options` goes on without.
                     _append(file, {name: source[name][:] for name in names if name in file})
 
@@ -335,7 +415,7 @@ def _hdf5(path: Path, mode: Literal["w", "r+"]) -> Iterator[h5py.File]:
                 raise OSError(disk.error.errno, disk.error.strerror, str(path)) from disk.error
 
 
-def episode_count(path: Path, config: EpisodeConfig) -> int:
+def episode_count(path: Path, config: World) -> int:
     """Number of episodes in a file; 0 when there is none.
 
     Raises:
@@ -355,39 +435,32 @@ def episode_count(path: Path, config: EpisodeConfig) -> int:
         problem = "is an HDF5 file but not an episode file"
     elif number != FORMAT_VERSION:
         problem = f"has format version {number}, and version {FORMAT_VERSION} cannot be appended to it"
-    elif found != _config_json(config):
-        problem = f"was collected with {found}, which differs from {_config_json(config)}"
+    elif found != config.to_json():
+        problem = f"was collected with {found}, which differs from {config.to_json()}"
     else:
         return count
     raise ValueError(f"{path} {problem}; choose another --out")
 
 
-def _create(file: h5py.File, config: EpisodeConfig) -> None:
+def _create(file: h5py.File, config: World) -> None:
     """Make all datasets, empty, and all attributes."""
-    split, setup = SPLITS[config.split], config.setup
-    camera = Camera(setup.camera, config.image_size, setup.oversampling)
-    for name, (shape, dtype, chunk, compression) in _ARRAYS.items():
+    split = SPLITS[config.split]
+    for name, (shape, dtype, chunk, compression) in config.arrays.items():
         shape = tuple(config.image_size if n == SIDE else n for n in shape)
         sizes = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (chunk, *shape)}
         file.create_dataset(name, dtype=dtype, **sizes, **compression)
-    for name, (dtype, _) in {"start": ("i8", None), **_columns(config)}.items():
+    for name, (dtype, _) in {"start": ("i8", None), **config.columns}.items():
         base, shape = (dtype.base, dtype.shape) if isinstance(dtype, np.dtype) else (dtype, ())
         file.create_dataset(
             f"episode/{name}", (0, *shape), base, maxshape=(None, *shape), chunks=(1024, *shape)
         )
-    versions = {name: version(name) for name in ("pybullet", "gymnasium", "numpy", "h5py")}
-    ur5 = find_package()
     file.attrs.update(
         format=FORMAT,
         format_version=FORMAT_VERSION,
         split=split.name,
         first_seed=split.first_seed,
-        config=_config_json(config),
-        versions=json.dumps(versions | {PACKAGE: ur5.version if ur5 else None}),
-        vocabulary=json.dumps(TASKS[config.task].vocabulary),
-        labels=json.dumps(LABELS),
-        camera_intrinsics=camera.intrinsics,
-        camera_extrinsics=camera.extrinsics,
+        config=config.to_json(),
+        **config.attributes,
     )
 
 
@@ -411,13 +484,6 @@ def _padded_supports(supports: Supports) -> tuple[int, ...]:
     return (*supports, *(NO_OBJECT,) * (MAX_OBJECTS - len(supports)))
 
 
-def _config_json(config: EpisodeConfig) -> str:
-    values = asdict(config) | {"factors": asdict(config.setup.factors)}
-    if config.policy == "expert":  # as in files that are older than other policies
-        del values["policy"], values["sentences"]
-    return json.dumps(values)
-
-
 # -- Many processes, one file ------------------------------------------------------------------------------
 
 
@@ -425,7 +491,7 @@ Backend = Literal["processes", "dask", "ray"]
 
 
 def collect(
-    config: EpisodeConfig, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes"
+    config: World, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes"
 ) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 
@@ -485,7 +551,7 @@ def _only_collector(out: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int, backend: Backend) -> None:
+def _collect(config: World, episodes: int, out: Path, workers: int, backend: Backend) -> None:
     done = episode_count(out, config)
     parts = out.with_name(out.name + ".parts")
     step = max(1, EPISODES_PER_PIECE // config.sentences) * config.sentences  # whole scenes
@@ -512,8 +578,8 @@ def _collect(config: EpisodeConfig, episodes: int, out: Path, workers: int, back
 
 
 @cache
-def _environment(config: EpisodeConfig, thread: int) -> TabletopEnv:
-    """One environment for each thread of a worker, whose PyBullet client is used again for each episode."""
+def _environment(config: World, thread: int) -> Any:
+    """What plays, one for each thread of a worker, whose PyBullet client is used again for each episode."""
     return config.make()
 
 
@@ -530,15 +596,17 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
-def _collect_piece(config: EpisodeConfig, start: int, stop: int, piece: Path, collector: int | None) -> None:
+def _collect_piece(config: World, start: int, stop: int, piece: Path, collector: int | None) -> None:
     if collector is not None:
         _end_with(collector)
     if episode_count(piece, config) == stop - start:
         return
     env = _environment(config, threading.get_ident())
-    episodes = list(record_episodes(env, config, range(start, stop)))
-    values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in _ARRAYS}
-    for name, (dtype, value) in _columns(config).items():
+    episodes = list(config.record(env, range(start, stop)))
+    values = {
+        name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in config.arrays
+    }
+    for name, (dtype, value) in config.columns.items():
         values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
     with atomically(piece, piece.parent) as part, _hdf5(part, "w") as file:
         _create(file, config)

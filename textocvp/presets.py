@@ -15,6 +15,7 @@ from textocvp.renderers.broadcast import BroadcastConfig
 from textocvp.renderers.carry import CarryConfig
 from textocvp.renderers.glimpse import GlimpseConfig
 from textocvp.renderers.patches import FeatureConfig, PatchConfig
+from textocvp.renderers.recall import RecallConfig
 from textocvp.renderers.upsample import UpsampleConfig
 from textocvp.slots import SlotLayout
 from textocvp.text.words import WordsConfig
@@ -116,6 +117,14 @@ CLIPORT = ModelConfig(
     text=SMALL_TEXT,
     predictor=replace(SMALL, color_bias=True, window=56),
 )
+# CATER-hard on CPUs: background, a place for a robot that is not there, at most 8 things, and one to spare.
+CATER = ModelConfig(
+    name="cater",
+    parser=VotesConfig(num_slots=11),
+    renderer=RecallConfig(),
+    text=WordsConfig(kind="transformer"),
+    predictor=replace(SMALL, window=29, appearance=True),
+)
 OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
 OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
 
@@ -125,6 +134,7 @@ _ALL = (
     SAVI_CATER,
     CLIPORT_DINO,
     CLIPORT,
+    CATER,
     OCVP_SEQ_SMALL,
     OCVP_SEQ,
     NON_OC_SMALL,
@@ -140,6 +150,7 @@ DESCRIPTIONS = {
     "savi-cater": "TextOCVP-SAVi at the paper's sizes (CATER)",
     "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
     "cliport": "TextOCVP for CLIPort's scene: a parser that has learned to see, and sharp frames of 336x336",
+    "cater": "TextOCVP for CATER-hard: a parser that has learned to see, words matched with what things look like",
     "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
     "ocvp-seq": "OCVP-Seq, no text, at its published size",
     "non-oc-small": "Non-OC, one slot for the whole scene, small",

@@ -247,7 +247,9 @@ class WorldModel:
         parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generators)
         slots_BTKD = parsed.slots_BTKD.float()
         seen = model.renderer.remember(frames_BT3HW[:, 0], parsed.attention_BTKHW[:, 0], slots_BTKD[:, 0])
-        size = self.image_size if seen is None else (frames_BT3HW.shape[-2], frames_BT3HW.shape[-1])
+        size = self.image_size
+        if seen is not None:
+            size = (seen[0].frame_3HW.shape[-2], seen[0].frame_3HW.shape[-1])
         return Rollout(slots_BTKD, (), size, model.parser.layout, model.renderer, seen=seen)
 
     def _start(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,6 +14,8 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from textocvp.text.wording import split
 
 FORMAT = "textocvp-episodes"
 FORMAT_VERSIONS = (1, 2)
@@ -385,4 +386,4 @@ def swapped_questions(
 
 def words_of(sentences: Iterable[str]) -> set[str]:
     """All words of some sentences, lower case."""
-    return set(re.findall(r"[a-z0-9']+", "\n".join(sentences).lower()))
+    return {word for sentence in set(sentences) for word in split(sentence)}

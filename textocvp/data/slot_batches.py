@@ -9,6 +9,7 @@ carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red" wou
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -71,6 +72,11 @@ class SlotBatches:
 
     def __len__(self) -> int:
         return len(self._slots_ETKD)
+
+    @cached_property
+    def content_std_C(self) -> Tensor:
+        """(C,) as `content_statistics`."""
+        return self.content_statistics()[1]
 
     def content_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (C,) of the content of used slots, over at most 1000 episodes."""

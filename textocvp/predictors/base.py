@@ -112,6 +112,11 @@ class SlotPredictor(nn.Module):
                 self.slot_out.bias.zero_()
 
     @property
+    def learns_words(self) -> bool:
+        """Whether `words_loss` has anything to learn."""
+        return False
+
+    @property
     def standardized(self) -> bool:
         """Whether content is read and changed in units of its deviation over the training data."""
         return self.layout.explicit or self.config.standardize
@@ -131,16 +136,20 @@ class SlotPredictor(nn.Module):
             (B, n, h, K, L), if any.
         """
 
-    def _text_context(self, text: TextTokens, slots_BKD: Tensor) -> Any:
+    def _text_context(self, text: TextTokens, slots_BTKD: Tensor, acting_BK: Tensor | None = None) -> Any:
         """What `_transform` needs of the text and of the slots that a rollout starts from."""
         return None
+
+    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor) -> Tensor:
+        """What there is to learn of words beside the prediction, a scalar; 0 by default."""
+        return slots_BKD.new_zeros(())
 
     def _tokens_per_frame(self, slots: int) -> int:
         """How many tokens of a frame with so many slots enter a cache."""
         return slots
 
-    def forward(self, slots_BTKD: Tensor, text: TextTokens) -> Tensor:
-        """Teacher forced: `out[:, t]` is the prediction for frame t + 1.
+    def forward(self, slots_BTKD: Tensor, text: TextTokens, acting_BK: Tensor | None = None) -> Tensor:
+        """Teacher forced: `out[:, t]` is the prediction for frame t + 1; `acting_BK` says which slots act, if known.
 
         In the `window` form every frame sees all T frames, so only `out[:, -1]` is a prediction.
 
@@ -148,7 +157,7 @@ class SlotPredictor(nn.Module):
             ValueError: if T is more than `config.window`, or the shapes do not fit.
         """
         self._check(slots_BTKD, text, past=slots_BTKD.shape[1])
-        state = self._start(slots_BTKD, text)
+        state = self._start(slots_BTKD, text, acting_BK=acting_BK)
         return self._predict(slots_BTKD, state, newest_only=False)[0]
 
     def rollout(
@@ -159,11 +168,13 @@ class SlotPredictor(nn.Module):
         *,
         use_cache: bool = True,
         return_attention: bool = False,
+        acting_BK: Tensor | None = None,
     ) -> Imagined:
         """Predict `steps` (S) frames after T seed frames, feeding predictions back. Differentiable.
 
         Args:
             use_cache: keep keys and values (`causal` form only); changes the speed and not the result.
+            acting_BK: which slots act, if that is known, as in training.
 
         Raises:
             ValueError: if S < 1, if the `causal` form would need a past of more than `config.window` frames, if the
@@ -180,7 +191,8 @@ class SlotPredictor(nn.Module):
         used_K = self.layout.used(seed_BTKD).flatten(0, 1).any(dim=0)
         used_k = (used_K | ~used_K.any()).nonzero().squeeze(-1)
         seed_BTkD = seed_BTKD[:, :, used_k]
-        state = self._start(seed_BTkD, text, cached_frames=longest if use_cache and self.config.causal else 0)
+        acting_Bk = None if acting_BK is None else acting_BK[:, used_k]
+        state = self._start(seed_BTkD, text, longest if use_cache and self.config.causal else 0, acting_Bk)
         frames = list(seed_BTkD.unbind(1))  # (B, k, D) each; first the T of the seed, in the end T + S
         maps = []
         for _ in range(steps):
@@ -197,11 +209,13 @@ class SlotPredictor(nn.Module):
         none_BSnhKL = maps_BSnhkL.new_zeros(*maps_BSnhkL.shape[:4], len(used_K), maps_BSnhkL.shape[-1])
         return Imagined(slots_BSKD, none_BSnhKL.index_copy(4, used_k, maps_BSnhkL))
 
-    def _start(self, seed_BTKD: Tensor, text: TextTokens, cached_frames: int = 0) -> RolloutState:
+    def _start(
+        self, seed_BTKD: Tensor, text: TextTokens, cached_frames: int = 0, acting_BK: Tensor | None = None
+    ) -> RolloutState:
         """The state before the first step, with caches for so many frames, or without any."""
         tokens = cached_frames * self._tokens_per_frame(seed_BTKD.shape[2])
         caches = [KeyValueCache(tokens) if tokens else None for _ in self.layers]
-        context = self._text_context(text, seed_BTKD[:, -1])
+        context = self._text_context(text, seed_BTKD, acting_BK)
         return RolloutState(context, caches, self.layout.used(seed_BTKD[:, :0]))
 
     def _predict(

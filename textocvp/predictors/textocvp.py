@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from textocvp.layers import MASKED, KeyValueCache, SelfAttention, TextAttention, mask_bias
+from textocvp.predictors.appearance import Appearance, acting_loss
 from textocvp.predictors.base import PredictorConfig, RolloutState, SlotPredictor, feed_forward
-from textocvp.slots import SlotState
+from textocvp.slots import SlotLayout, SlotState
 
 if TYPE_CHECKING:
     from textocvp.text.base import TextTokens
@@ -27,6 +28,14 @@ class TextOCVPConfig(PredictorConfig):
     # Add `color_match` to the logits of the attention to the words, which the published model does not do. Needs
     # explicit slots and a text encoder whose words carry RGB.
     color_bias: bool = False
+    # Add how well a slot's learned appearance fits a word, for words without RGB; needs explicit slots.
+    appearance: bool = False
+
+    def __post_init__(self) -> None:
+        if self.color_bias and self.appearance:
+            raise ValueError(
+                "predictor.appearance and predictor.color_bias exclude each other: set one to false"
+            )
 
 
 class TextContext(NamedTuple):
@@ -44,11 +53,39 @@ class TextOCVPPredictor(SlotPredictor):
     uses_text = True
     config: TextOCVPConfig
 
+    def __init__(self, config: TextOCVPConfig, layout: SlotLayout, text_dim: int) -> None:
+        super().__init__(config, layout, text_dim)
+        self.appearance = Appearance(layout, text_dim) if config.appearance else None
+
     def _layer(self, text_dim: int) -> nn.Module:
         return TextOCVPLayer(self.config, text_dim)
 
-    def _text_context(self, text: TextTokens, slots_BKD: Tensor) -> TextContext:
-        match_BKL = None
+    @property
+    def learns_words(self) -> bool:
+        return self.appearance is not None
+
+    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor) -> Tensor:
+        """What the matching of words with slots gets wrong about which slots act; 0 without such a matching."""
+        if self.appearance is None:
+            return slots_BKD.new_zeros(())
+        shares_BKL, acts_BL = self._matched(text, slots_BKD, None)
+        used_BK = SlotState.split(slots_BKD, self.layout).is_thing[..., 0]
+        return acting_loss(shares_BKL, acts_BL, acting_BK, used_BK)
+
+    def _matched(
+        self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        assert self.appearance is not None
+        state = SlotState.split(slots_BKD, self.layout)
+        content_BKC = (state.content - self.content_mean_C) / self.content_std_C
+        return self.appearance(content_BKC, state, text.embeddings_BLC, text.mask_BL, acting_BK)
+
+    def _text_context(
+        self, text: TextTokens, slots_BTKD: Tensor, acting_BK: Tensor | None = None
+    ) -> TextContext:
+        match_BKL, slots_BKD = None, slots_BTKD[:, -1]
+        if self.appearance is not None:
+            match_BKL = Appearance.bias(*self._matched(text, slots_BTKD[:, 0], acting_BK))
         if self.config.color_bias:
             color_BK3 = SlotState.split(slots_BKD, self.layout).color
             match_BKL = color_match(color_BK3, self.layout.used(slots_BKD), text)
@@ -83,8 +120,10 @@ class TextOCVPLayer(nn.Module):
         self.norm_text = nn.LayerNorm(config.dim, eps=1e-6)
         self.text_attention = TextAttention(config.dim, config.heads, text_dim)
         self.feed_forwards = nn.ModuleList(feed_forward(config) for _ in range(config.feed_forwards))
-        # How much a slot of the wrong colour loses of a word's attention, per unit of squared RGB distance.
-        self.color_gain_h = nn.Parameter(torch.full((config.heads,), 4.0)) if config.color_bias else None
+        # How much a slot loses of a word's attention that does not fit it, per unit of squared RGB distance or
+        # of the logarithm of its share.
+        matched, gain = config.color_bias or config.appearance, 4.0 if config.color_bias else 1.0
+        self.color_gain_h = nn.Parameter(torch.full((config.heads,), gain)) if matched else None
 
     def forward(
         self,

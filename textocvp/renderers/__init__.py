@@ -7,6 +7,7 @@ from textocvp.renderers.broadcast import BroadcastRenderer
 from textocvp.renderers.carry import CarryRenderer
 from textocvp.renderers.glimpse import GlimpseRenderer
 from textocvp.renderers.patches import FeatureRenderer, PatchRenderer
+from textocvp.renderers.recall import RecallRenderer
 from textocvp.renderers.upsample import UpsampleRenderer
 from textocvp.slots import SlotLayout
 
@@ -15,6 +16,7 @@ __all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "Seen", "build
 RENDERERS: dict[str, type[Renderer]] = {
     "glimpse": GlimpseRenderer,  # a small picture a slot, pasted at the slot's place: the renderer that ships
     "carry": CarryRenderer,  # the same, and what the first frame shows is copied from it
+    "recall": RecallRenderer,  # drawn as by glimpse, and corrected by what was wrong about the first frame
     "patches": PatchRenderer,  # an MLP draws patch by patch
     "features": FeatureRenderer,  # published for CLIPort: the MLP redraws DINOv2's features
     "broadcast": BroadcastRenderer,  # published for CATER: spatial broadcast decoder

@@ -14,7 +14,8 @@ NEGATIONS = frozenset((
     "doesnt", "mustnt", "shouldnt", "wont",
 ))  # fmt: skip
 
-_WORD = re.compile(r"[\w']+")  # of any script: what cannot be read is to be named
+# Of any script: what cannot be read is to be named. A number keeps its sign, but "pick-2" is two words.
+_WORD = re.compile(r"(?<![\w'])-\d+(?![\w'])|[\w']+")
 _NAME = re.compile(r"{([a-z]+)}")
 
 

@@ -28,7 +28,7 @@ SPECIAL = ("<pad>", "<unk>", "<color>")
 PAD, UNKNOWN, COLOR = range(3)
 
 
-_WORD = re.compile(r"[a-z0-9']+")  # what a vocabulary may contain
+_WORD = re.compile(r"-\d+|[a-z0-9']+")  # what a vocabulary may contain
 MOST_FORMS = 32  # captions of more forms than these are free text, whose forms say little
 
 # Tableau's 2016 categorical palette, which matplotlib lacks (its `tab:` colours are the older one). Tableau
@@ -73,7 +73,9 @@ class WordsConfig(TextConfig):
     def __post_init__(self) -> None:
         wrong = [word for word in self.vocabulary if not _WORD.fullmatch(word)]
         if wrong:
-            raise ValueError(f"text.vocabulary: {wrong[0]!r} is no word of lower-case letters and digits")
+            raise ValueError(
+                f"text.vocabulary: {wrong[0]!r} is no word of lower-case letters and digits, and no number"
+            )
         if len(set(self.vocabulary)) < len(self.vocabulary):
             raise ValueError("text.vocabulary has a word twice")
         unknown = [word for word in self.untrained if word not in self.vocabulary]

@@ -13,6 +13,9 @@ from torch import Tensor
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.slots import SlotLayout, SlotState, moments
 
+ACTS = 0.07  # it acts when it gets further than this from its place, -1..1: two pixels of 64,
+TURNS = 1.0  # or when its content changes by so many of its deviations, in the mean square
+REACHED = 0.07  # or when one that moves comes to rest so near to it
 MOVES = 0.015  # a slot moves when its centre shifts by more than this in a frame, -1..1: half a pixel of 64
 UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
 
@@ -160,6 +163,20 @@ def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, eve
         moves_BTK = moves_BTK.any(dim=1, keepdim=True).expand_as(moves_BTK)
     present_BTK = state.presence[:, 1:, :, 0] >= 0.5
     return present_BTK * (1.0 + (moving - 1.0) * moves_BTK)
+
+
+def acting(slots_BTKD: Tensor, layout: SlotLayout, content_std_C: Tensor) -> Tensor:
+    """Which slots act in their frames (B, K) bool: that move or turn, or that one that moves is put onto."""
+    state = SlotState.split(slots_BTKD, layout)
+    far_BK = (state.position - state.position[:, :1]).norm(dim=-1).amax(1)
+    moves_BK = (far_BK > ACTS) & state.is_thing[:, 0, :, 0]
+    turned_BTK = (
+        ((state.content - state.content[:, :1]) / content_std_C.to(slots_BTKD.device)).square().mean(-1)
+    )
+    turns_BK = (turned_BTK[:, -1] > TURNS) & state.is_thing[:, 0, :, 0]
+    ends_BKK = torch.cdist(state.position[:, 0], state.position[:, -1])  # from each slot to where each ends
+    reached_BK = ((ends_BKK < REACHED) & moves_BK[:, None]).any(2) & state.is_thing[:, 0, :, 0]
+    return moves_BK | turns_BK | reached_BK
 
 
 def drawn_loss(

@@ -41,7 +41,7 @@ from textocvp.training.evaluate_predictor import (
     SlotErrors,
     measure_outcomes,
 )
-from textocvp.training.losses import drawn_loss, moving_weights, slot_loss
+from textocvp.training.losses import acting, drawn_loss, moving_weights, slot_loss
 from textocvp.training.run import (
     Run,
     SettingsError,
@@ -83,6 +83,8 @@ class PredictorTraining(TrainingSettings):
     """Weight of the error in size."""
     content_weight: float = 0.3
     """Weight of the error in content."""
+    words_weight: float = 1.0
+    """Weight of what the words say of which slots act, where they are matched with what slots look like."""
     image_weight: float = 0.0
     """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
     image_frames: int = 2
@@ -98,22 +100,29 @@ class PredictorStage(nn.Module):
         if not self.predictor.uses_text:  # several processes would wait for gradients that never come
             self.text.requires_grad_(False)
 
-    def forward(self, given_BTKD: Tensor, words: WordBatch, imagined: int) -> Tensor:
+    def forward(
+        self, given_BTKD: Tensor, words: WordBatch, imagined: int, acting_BK: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Predictions (B, S, K, D), the last of which is of frame number T + imagined (the first is number 0).
 
         The `causal` form predicts from every given and every imagined frame the next, S = T + imagined. The `window`
-        form only predicts new frames, S = imagined + 1.
+        form only predicts new frames, S = imagined + 1. With them comes what the words get wrong about which slots act,
+        if that is told.
         """
         text = self.text.encode(words)
+        told = {} if acting_BK is None else {"acting_BK": acting_BK}
+        words_loss = given_BTKD.new_zeros(())
+        if acting_BK is not None:
+            words_loss = self.predictor.words_loss(text, given_BTKD[:, 0], acting_BK)
         if not self.predictor.config.causal:
-            return self.predictor.rollout(given_BTKD, text, imagined + 1).slots_BSKD
+            return self.predictor.rollout(given_BTKD, text, imagined + 1, **told).slots_BSKD, words_loss
         if imagined:
             with torch.no_grad():
-                imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined).slots_BSKD
+                imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined, **told).slots_BSKD
             # Under autocast some versions of torch would reuse weights that were cast without a gradient.
             torch.clear_autocast_cache()
             given_BTKD = torch.cat([given_BTKD, imagined_BSKD], dim=1)
-        return self.predictor(given_BTKD, text)
+        return self.predictor(given_BTKD, text, **told), words_loss
 
 
 def schedule(
@@ -195,15 +204,21 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
             true_BTKD = batch.slots_BTKD[:, first - 1 : last + 1]
             weights_BSK = moving_weights(true_BTKD, layout, args.moving, ever=imagined > 0)
             weights_BSK = weights_BSK / weights_BSK.sum().clamp(min=1e-6)
+            acting_BK = (
+                acting(batch.slots_BTKD, layout, batches.content_std_C) if predictor.learns_words else None
+            )
 
             for rows in run.micro_batches(of_batch=True):
                 slots_BTKD, target_BSKD, weights = (
                     whole[rows].to(run.device) for whole in (given_BTKD, true_BTKD[:, 1:], weights_BSK)
                 )
                 words = batch.words.select(rows).to(run.device)
-                predicted_BSKD = run.module(slots_BTKD, words, imagined).float()
+                told = None if acting_BK is None else acting_BK[rows].to(run.device)
+                predicted_BSKD, words_loss = run.module(slots_BTKD, words, imagined, told)
+                predicted_BSKD = predicted_BSKD.float()
                 loss = slot_loss(predicted_BSKD, target_BSKD, weights, layout, std_C)
-                total = loss.total(args.scale_weight, args.content_weight)
+                words_loss = run.weight(rows) * words_loss
+                total = loss.total(args.scale_weight, args.content_weight) + args.words_weight * words_loss
                 if args.image_weight > 0:
                     times_BF = every * (first + drawn_BF[rows])
                     true_BF3HW = true_frames(
@@ -211,7 +226,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
                     )
                     image = drawn_loss(model.renderer, predicted_BSKD, drawn_BF[rows], true_BF3HW)
                     total = total + args.image_weight * run.weight(rows) * image
-                run.backward(total, vars(loss))
+                run.backward(total, vars(loss) | ({} if told is None else {"words": words_loss}))
             run.update(step, {"horizon": 1.0 + imagined})
             run.evaluate(step, measure)
         metrics = run.finish(model.save_pretrained, measure, "outcomes.json" if args.outcome else held.file)

@@ -2,7 +2,8 @@
 
 The camera stands still, so the median of an episode's frames shows the scene without what moves, and its commonest
 colours are those of floor and table. What has none of them is foreground; gray parts of it that reach into the upper
-third are the robot, and connected parts of one hue are objects.
+third are the robot, and connected parts of one hue are objects. Where no colours are common because light falls
+unevenly on a gray floor (CATER), the floor's light is a smooth surface, and there is no robot.
 """
 
 from __future__ import annotations
@@ -26,6 +27,19 @@ MIXED = 0.35  # share of a thing in the colour of a pixel up to which the pixel 
 GRAY = 26  # of 255: difference between channels up to which a pixel is gray
 SAME_HUE = 0.035  # difference of chroma between neighbours up to which they are one thing
 MIN_PIXELS = 4
+FLAT = 0.6  # share of the picture that the commonest colours must have
+# Of a floor in uneven light: what differs more from it in colour, in 0..255, or is this much darker or lighter.
+FLOOR_CHROMA, DARKER, LIGHTER = 14.0, 0.66, 1.06
+FLOOR_HUE = 0.07  # as SAME_HUE
+FLOOR_ORDER = 4  # of the polynomial that the floor's light is
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """What an episode shows without its things: its commonest colours (N, 3), or the light (H, W) on a gray floor."""
+
+    tones_N3: NDArray[np.float32]
+    floor_HW: NDArray[np.float32] | None = None
 
 
 @dataclass
@@ -39,7 +53,7 @@ class Teacher:
 
     kind: Literal["video", "masks"]
     episodes: Episodes
-    _tones: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    _backdrops: dict[int, Backdrop] = field(default_factory=dict)
 
     def labels(self, starts: NDArray[np.int64], frames_BTHW3: NDArray[np.uint8], stride: int) -> Labels:
         """Labels (B, T, H, W) of clips of every `stride`-th frame from these starts on.
@@ -54,9 +68,9 @@ class Teacher:
                 first = start - self.episodes.starts[index]
                 found.append(self._given(index)[first:][: len(frames_THW3) * stride : stride])
                 continue
-            if index not in self._tones:
-                self._tones[index] = background_tones(self.episodes.frames(index))
-            found.append(video_masks(frames_THW3, self._tones[index]))
+            if index not in self._backdrops:
+                self._backdrops[index] = backdrop(self.episodes.frames(index))
+            found.append(video_masks(frames_THW3, self._backdrops[index]))
         return np.stack(found)
 
     def _given(self, index: int) -> Labels:
@@ -67,9 +81,35 @@ class Teacher:
         return np.where(robot, 1, labels + ((labels > 0) & (truth.robot != 1))).astype(np.uint8)
 
 
-def background_tones(frames_THW3: NDArray[np.uint8]) -> NDArray[np.float32]:
+def backdrop(frames_THW3: NDArray[np.uint8]) -> Backdrop:
+    """What stays behind the things of an episode."""
+    median_HW3 = np.median(frames_THW3, axis=0).astype(np.float32)
+    tones_N3 = background_tones(median_HW3)
+    near_HW = (np.abs(median_HW3[:, :, None] - tones_N3).max(-1) <= TONE_RADIUS).any(-1)
+    return Backdrop(tones_N3, None if near_HW.mean() >= FLAT else _floor(median_HW3))
+
+
+def _floor(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The light on a gray floor, fitted to what lies near to it."""
+    H, W, _ = median_HW3.shape
+    y_HW, x_HW = np.mgrid[-1 : 1 : H * 1j, -1 : 1 : W * 1j]
+    powers = [(i, j) for i in range(FLOOR_ORDER + 1) for j in range(FLOOR_ORDER + 1 - i)]
+    terms_NP = np.stack([(x_HW**i * y_HW**j).ravel() for i, j in powers], 1)
+    light_N = median_HW3.mean(-1).ravel()
+    gray_N = np.ptp(median_HW3, axis=-1).ravel() <= FLOOR_CHROMA
+    if gray_N.sum() < 4 * len(powers):
+        gray_N[:] = True
+    kept_N = gray_N
+    for _ in range(8):
+        fit_N = terms_NP @ np.linalg.lstsq(terms_NP[kept_N], light_N[kept_N], rcond=None)[0]
+        off_N = np.abs(light_N - fit_N)
+        kept_N = gray_N & (off_N <= max(3 * float(np.median(off_N[kept_N])), 2.0))
+    return fit_N.reshape(H, W).astype(np.float32)
+
+
+def background_tones(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
     """The commonest colours (N, 3) of the median frame, at least one."""
-    left = np.median(frames_THW3, axis=0).reshape(-1, 3).astype(np.float32)
+    left = median_HW3.reshape(-1, 3)
     total = len(left)
     tones: list[NDArray[np.float32]] = []
     while len(left):
@@ -84,9 +124,26 @@ def background_tones(frames_THW3: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.array(tones, np.float32)
 
 
-def video_masks(frames_NHW3: NDArray[np.uint8], tones_K3: NDArray[np.float32]) -> Labels:
+def video_masks(frames_NHW3: NDArray[np.uint8], behind: Backdrop) -> Labels:
     """Labels (N, H, W) of frames: 0 background, 1 robot, 2 and more one for each object of a frame."""
-    return np.stack([_frame_masks(frame.astype(np.float32), tones_K3) for frame in frames_NHW3])
+    frames = frames_NHW3.astype(np.float32)
+    if behind.floor_HW is None:
+        return np.stack([_frame_masks(frame_HW3, behind.tones_N3) for frame_HW3 in frames])
+    return np.stack([_masks_on_floor(frame_HW3, behind.floor_HW) for frame_HW3 in frames])
+
+
+def _masks_on_floor(frame_HW3: NDArray[np.float32], floor_HW: NDArray[np.float32]) -> Labels:
+    """Shadows are a little darker than the floor and as gray; all else is a thing."""
+    share_HW = frame_HW3.mean(-1) / floor_HW.clip(1)
+    colored_HW = np.ptp(frame_HW3, axis=-1) > FLOOR_CHROMA
+    solid = ndimage.binary_fill_holes(colored_HW | (share_HW < DARKER) | (share_HW > LIGHTER))
+    return _numbered(_parts_of_one_hue(frame_HW3, solid, FLOOR_HUE), np.zeros(solid.shape, np.uint8))
+
+
+def _numbered(things_HW: NDArray[np.int64], labels_HW: Labels) -> Labels:
+    for number, part in enumerate(np.unique(things_HW[things_HW > 0])[:250]):
+        labels_HW[things_HW == part] = 2 + number
+    return labels_HW
 
 
 def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) -> Labels:
@@ -100,10 +157,7 @@ def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) 
     parts, _ = ndimage.label(gray)
     high = np.unique(parts[: len(parts) // 3])
     labels[np.isin(parts, high[high > 0])] = 1
-    things = _parts_of_one_hue(frame_HW3, solid & (labels == 0))
-    for number, part in enumerate(np.unique(things[things > 0])[:250]):
-        labels[things == part] = 2 + number
-    return labels
+    return _numbered(_parts_of_one_hue(frame_HW3, solid & (labels == 0)), labels)
 
 
 def _mostly(tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -119,7 +173,9 @@ def _mostly(tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32]) -> ND
     return mostly_HW
 
 
-def _parts_of_one_hue(frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _parts_of_one_hue(
+    frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_], same_hue: float = SAME_HUE
+) -> NDArray[np.int64]:
     """Connected parts, each with a number above 0."""
     chroma_HW3 = frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
     count = int(inside_HW.sum())
@@ -128,7 +184,7 @@ def _parts_of_one_hue(frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool
     ends: tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]] = [], []
     for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         linked = inside_HW[a] & inside_HW[b]
-        close = np.abs(chroma_HW3[a][linked] - chroma_HW3[b][linked]).max(-1) <= SAME_HUE
+        close = np.abs(chroma_HW3[a][linked] - chroma_HW3[b][linked]).max(-1) <= same_hue
         ends[0].append(number[a][linked][close])
         ends[1].append(number[b][linked][close])
     one, other = map(np.concatenate, ends)

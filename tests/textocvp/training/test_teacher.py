@@ -16,7 +16,7 @@ from textocvp.data.episodes import EpisodeFile
 from textocvp.presets import PRESETS
 from textocvp.training.light import relight
 from textocvp.training.run import SettingsError
-from textocvp.training.teacher import Teacher, background_tones, video_masks
+from textocvp.training.teacher import Teacher, backdrop, video_masks
 
 FLOOR, TABLE, DARK, LIGHT = (200, 204, 198), (60, 58, 62), (30, 30, 34), (110, 110, 112)
 
@@ -39,9 +39,9 @@ def painted() -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_clean_video_gives_its_own_masks() -> None:
     frames, labels = painted()
-    tones = background_tones(frames)
-    assert sorted(tones.tolist()) == sorted([list(map(float, FLOOR)), list(map(float, TABLE))])
-    found = video_masks(frames, tones)
+    behind = backdrop(frames)
+    assert sorted(behind.tones_N3.tolist()) == sorted([list(map(float, FLOOR)), list(map(float, TABLE))])
+    found = video_masks(frames, behind)
     for mine, truth in zip(found, labels, strict=True):
         assert np.array_equal(mine == 0, truth == 0) and np.array_equal(mine == 1, truth == 1)
         for label in (2, 3, 4):
@@ -51,12 +51,12 @@ def test_a_clean_video_gives_its_own_masks() -> None:
 
 def test_mixed_colours_at_a_border_belong_to_what_they_are_mostly() -> None:
     frames, labels = painted()
-    tones = background_tones(frames)
+    behind = backdrop(frames)
     # A row of pixels above the upper block in a bowl shows a fifth of it, the row below it nine tenths.
     block = np.array((200, 60, 60), float)
     for row, share in ((27, 0.2), (40, 0.9)):
         frames[0, row, 4:13] = share * block + (1 - share) * np.array(TABLE, float)
-    found = video_masks(frames[:1], tones)[0]
+    found = video_masks(frames[:1], behind)[0]
     assert np.array_equal(found[27, 4:13] > 0, np.zeros(9, bool))
     assert np.array_equal(found[40, 5:12] == found[38, 10], np.ones(7, bool))
     assert np.array_equal(found[28:40] > 0, labels[0, 28:40] > 0)

@@ -1,0 +1,129 @@
+"""Clips of CATER-hard for `envs.dataset`: what `python -m envs.collect --world cater` writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..dataset import ARRAYS, TEXT, Columns, versions
+from ..splits import SPLITS
+from .scenes import ACTIONS, COLORS, FRAMES, MATERIALS, SIZES, Clip, draw_clip
+from .world import Table
+
+Captions = Literal["explicit", "ambiguous"]
+LABELS = {"background": 0}  # thing i has the label 1 + i
+WORDS = "the is rotating sliding to picked up and placed containing snitch gold quadrant first second third fourth"
+
+
+@dataclass(frozen=True)
+class RecordedClip:
+    """One clip as it is written."""
+
+    seed: int
+    instruction: str
+    clip: Clip
+    arrays: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class CaterConfig:
+    """What, beside the seed, decides the content of a clip.
+
+    Attributes:
+        split: a name of `SPLITS`; "train", "val" and "test" differ in their seeds alone.
+        image_size: height and width, in pixels.
+        captions: explicit ones name every attribute and the cell, ambiguous ones some attributes and the quadrant.
+    """
+
+    split: str
+    image_size: int = 64
+    captions: Captions = "explicit"
+    world: str = "cater"
+    sentences = 1
+
+    def make(self) -> Table:
+        """What draws the clips."""
+        return Table(self.image_size)
+
+    def record(self, table: Table, numbers: range) -> Iterator[RecordedClip]:
+        """Clips of the split; a function of the configuration and the numbers alone."""
+        for number in numbers:
+            seed = SPLITS[self.split].seed(number)
+            clip, jitter = clip_of(seed)
+            table.build(clip, jitter)
+            drawn = [table.render(frame) for frame in range(FRAMES)]
+            poses = [clip.poses(frame) for frame in range(FRAMES)]
+            said = clip.instruction
+            if self.captions == "ambiguous":
+                said = clip.ambiguous(np.random.default_rng([seed, 3]))
+            yield RecordedClip(
+                seed,
+                said,
+                clip,
+                {
+                    "frames": np.stack([frame for frame, _ in drawn]),
+                    "segmentation": np.stack([labels for _, labels in drawn]),
+                    "object_position": np.stack([centers for centers, _ in poses]).astype(np.float32),
+                    "object_orientation": np.stack([turns for _, turns in poses]).astype(np.float32),
+                },
+            )
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """The data sets over frames."""
+        names = ("frames", "segmentation", "object_position", "object_orientation")
+        return {name: ARRAYS[name] for name in names}
+
+    @property
+    def columns(self) -> Columns:
+        """The data sets over episodes: type and value."""
+        return {
+            "length": ("i8", lambda recorded: FRAMES),
+            "seed": ("i8", lambda recorded: recorded.seed),
+            "instruction": (TEXT, lambda recorded: recorded.instruction),
+            "objects": (TEXT, lambda recorded: json.dumps(_objects(recorded.clip))),
+            "actions": (TEXT, lambda recorded: json.dumps([asdict(act) for act in recorded.clip.acts])),
+        }
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The file's attributes, beside its format and configuration."""
+        camera = Table(self.image_size).camera
+        numbers = [str(n) for n in (-3, -2, -1, 1, 2, 3)]
+        vocabulary = [*WORDS.split(), *SIZES, *MATERIALS, *COLORS, *ACTIONS, *numbers]
+        return {
+            "versions": json.dumps(versions("pybullet", "numpy", "h5py")),
+            "vocabulary": json.dumps(list(dict.fromkeys(vocabulary))),
+            "labels": json.dumps(LABELS),
+            "camera_intrinsics": camera.intrinsics,
+            "camera_extrinsics": camera.extrinsics,
+        }
+
+    def to_json(self) -> str:
+        """The configuration, by which files are compared."""
+        return json.dumps(asdict(self))
+
+
+def clip_of(seed: int) -> tuple[Clip, NDArray[np.float64]]:
+    """The clip with this seed, and how far its light is off its place (3,)."""
+    rng = np.random.default_rng([seed, 4])
+    return draw_clip(rng), rng.uniform(-1, 1, 3)
+
+
+def _objects(clip: Clip) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": number,
+            "label": 1 + number,
+            "kind": thing.shape,
+            "color": thing.color,
+            "size": thing.size,
+            "material": thing.material,
+        }
+        for number, thing in enumerate(clip.things)
+    ]

@@ -1,0 +1,220 @@
+"""CATER's table in PyBullet: a clip's things as bodies without physics, drawn frame by frame."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise, product
+from math import cos, hypot, pi, sin
+
+import numpy as np
+import pybullet as p
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFilter
+
+from ..physics.camera import Camera, CameraPreset
+from ..physics.shapes import Mesh
+from ..physics.simulation import Bullet
+from .scenes import EYE, Clip, Thing
+
+CAMERA = CameraPreset(eye=EYE, target=(0.0, 0.0, 0.2), fov=42.0, near=5.0, far=40.0)
+OVERSAMPLING = 2  # pixels of a frame average so many drawn ones along each axis
+FLOOR = 165.0  # gray of the floor, 0..255
+LIGHT = (3.0, -1.0, 6.0)  # from where it comes; jittered by up to 1 in each direction
+AMBIENT, DIFFUSE, SPECULAR = 0.55, 0.45, 2.0
+SHINE = {"rubber": 0.05, "metal": 0.9}
+VIGNETTE = 0.2  # how much darker a corner of the floor is
+SHADE, SOFT = 0.3, 0.012  # how much darker a shadow is, and how wide its border, in sides of the frame
+SEGMENTS = 20  # corners of a circle
+OUTLINE = 12  # and of one that throws a shadow
+
+
+class Table:
+    """One PyBullet client with the floor, and the things of one clip after the other."""
+
+    def __init__(self, image_size: int) -> None:
+        self.camera = Camera(CAMERA, image_size, OVERSAMPLING)
+        self.bullet = Bullet(p.connect(p.DIRECT))
+        self.clip: Clip | None = None
+        self.bodies: list[int] = []
+
+    def build(self, clip: Clip, jitter: NDArray[np.float64]) -> None:
+        """Put the things of a clip in place of those that are there; `jitter` (3,) is added to the light's place."""
+        for body in self.bodies:
+            self.bullet.removeBody(body)
+        self.clip, self.bodies = clip, [self._add(thing) for thing in clip.things]
+        self.light = np.array(LIGHT) + jitter
+
+    def render(self, frame: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The clip at a frame (H, W, 3), and its labels (H, W): 0 the floor, 1 + i thing i."""
+        assert self.clip is not None
+        centers, turns = self.clip.poses(frame)
+        for body, center, turn in zip(self.bodies, centers, turns, strict=True):
+            self.bullet.resetBasePositionAndOrientation(body, center.tolist(), turn.tolist())
+        n, many = self.camera.size, OVERSAMPLING
+        size = n * many
+        _, _, rgba, _, bodies = self.bullet.getCameraImage(
+            size,
+            size,
+            self.camera.view_matrix,
+            self.camera.projection_matrix,
+            lightDirection=self.light.tolist(),
+            lightAmbientCoeff=AMBIENT,
+            lightDiffuseCoeff=DIFFUSE,
+            lightSpecularCoeff=SPECULAR,
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+        )
+        bodies = np.asarray(bodies).reshape(size, size)
+        things = np.asarray(rgba, np.uint8).reshape(size, size, 4)[..., :3]
+        floor = self._floor(centers, turns)
+        drawn = np.where(bodies[..., None] < 0, floor[..., None], things)
+        image = drawn.reshape(n, many, n, many, 3).mean((1, 3), dtype=np.float32)
+        labels = np.zeros(max(self.bodies) + 2, np.uint8)
+        labels[np.array(self.bodies) + 1] = np.arange(1, len(self.bodies) + 1)
+        # Of an even number of drawn pixels one has the corner that TinyRenderer samples in the middle.
+        seen = labels[bodies[(many - 1) // 2 :: many, many // 2 :: many] + 1]
+        return (image + 0.5).astype(np.uint8), seen
+
+    def _floor(self, centers: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
+        """The floor (S, S) with the things' shadows, each the outline of what it hides from the light."""
+        # PyBullet's renderer throws shadows of its own, hard ones, at four times the cost of a frame.
+        assert self.clip is not None
+        size = self.camera.size * OVERSAMPLING
+        picture = Image.new("L", (size, size))
+        draw = ImageDraw.Draw(picture)
+        drawn = Camera(CAMERA, size)
+        for thing, center, turn in zip(self.clip.things, centers, turns, strict=True):
+            points = _rotated(thing.radius * _outline(thing.shape), turn) + center
+            points = points - np.maximum(points[:, 2:], 0) * (self.light / self.light[2])
+            draw.polygon(_hull(drawn.project(points)), fill=255)
+        soft = np.asarray(picture.filter(ImageFilter.GaussianBlur(SOFT * size)), np.float32) / 255
+        floor: NDArray[np.float32] = _empty_floor(size) * (1 - np.float32(SHADE) * soft)
+        return floor
+
+    def close(self) -> None:
+        """Disconnect."""
+        p.disconnect(self.bullet.client)
+
+    def _add(self, thing: Thing) -> int:
+        r = thing.radius
+        look = {
+            "rgbaColor": [*(value / 255 for value in thing.rgb), 1.0],
+            "specularColor": [SHINE[thing.material]] * 3,
+        }
+        if thing.shape == "cube":
+            half = [r / 2**0.5] * 3
+            shape = self.bullet.createVisualShape(p.GEOM_BOX, halfExtents=half, **look)
+        else:
+            mesh = MESHES[thing.shape]()
+            scaled = [[r * value for value in vertex] for vertex in mesh.vertices]
+            shape = self.bullet.createVisualShape(
+                p.GEOM_MESH, vertices=scaled, normals=mesh.normals, indices=mesh.indices, **look
+            )
+        return int(self.bullet.createMultiBody(0, -1, shape, [0, 0, -10]))
+
+
+@lru_cache(maxsize=4)
+def _empty_floor(size: int) -> NDArray[np.float32]:
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    return (FLOOR * (1 - VIGNETTE / 2 * (axis[:, None] ** 2 + axis**2))).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _outline(shape: str) -> NDArray[np.float64]:
+    """Points (N, 3) whose convex hull is a thing of radius 1."""
+    if shape == "cube":
+        return np.array([*product((-1.0, 1.0), repeat=3)]) / 2**0.5
+    ring = np.exp(2j * pi * np.arange(OUTLINE) / OUTLINE)
+    circle = np.stack([ring.real, ring.imag, 0 * ring.real], 1)
+    if shape == "cone":
+        return np.array([*(circle - (0, 0, 1)), (0, 0, 1)])
+    if shape == "cylinder":
+        return np.concatenate([circle * 0.9 - (0, 0, 1), circle * 0.9 + (0, 0, 1)])
+    return np.concatenate(
+        [circle * r + (0, 0, z) for r, z in ((0.5, -0.87), (0.87, -0.5), (1, 0), (0.87, 0.5), (0.5, 0.87))]
+    )
+
+
+def _rotated(points: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (N, 3) turned by a quaternion x y z w."""
+    sideways = 2 * np.cross(turn[:3], points)
+    return points + turn[3] * sideways + np.cross(turn[:3], sideways)
+
+
+def _hull(points: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """The corners of the convex hull of points (N, 2) in order (Andrew's monotone chain)."""
+    ordered = sorted(map(tuple, points.tolist()))
+    hull: list[tuple[float, float]] = []
+    for half in (ordered, ordered[::-1]):
+        chain: list[tuple[float, float]] = []
+        for x, y in half:
+            while len(chain) > 1 and _turns_right(chain[-2], chain[-1], (x, y)):
+                chain.pop()
+            chain.append((x, y))
+        hull += chain[:-1]
+    return hull
+
+
+def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) <= 0
+
+
+@lru_cache(maxsize=1)
+def _cone() -> Mesh:
+    return _lathed([(0.0, -1.0), (1.0, -1.0), (0.02, 1.0), (0.0, 1.0)])
+
+
+@lru_cache(maxsize=1)
+def _cylinder() -> Mesh:
+    return _lathed([(0.0, -1.0), (0.9, -1.0), (0.9, 1.0), (0.0, 1.0)])
+
+
+@lru_cache(maxsize=1)
+def _sphere() -> Mesh:
+    angles = [pi * k / 12 - pi / 2 for k in range(13)]
+    return _lathed([(cos(a), sin(a)) for a in angles], round=True)
+
+
+@lru_cache(maxsize=1)
+def _snitch() -> Mesh:
+    """Three tori around one centre, each across the other two."""
+    ring, tube, around, across = 0.75, 0.25, 16, 8
+    vertices: list[list[float]] = []
+    normals: list[list[float]] = []
+    indices: list[int] = []
+    for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        first = len(vertices)
+        for i in range(around):
+            for j in range(across):
+                a, b = 2 * pi * i / around, 2 * pi * j / across
+                normal = (cos(a) * cos(b), sin(a) * cos(b), sin(b))
+                point = (ring * cos(a), ring * sin(a), 0.0)
+                vertices.append([point[k] + tube * normal[k] for k in axes])
+                normals.append([normal[k] for k in axes])
+                here, right = first + i * across, first + (i + 1) % around * across
+                k, up = j, (j + 1) % across
+                indices += [here + k, right + k, right + up, here + k, right + up, here + up]
+    return Mesh(vertices, normals, indices)
+
+
+MESHES = {"cone": _cone, "cylinder": _cylinder, "sphere": _sphere, "snitch": _snitch}
+
+
+def _lathed(profile: list[tuple[float, float]], round: bool = False) -> Mesh:
+    """A profile (radius, height), its solid on the left, turned around the z axis; `round` shades it as a ball."""
+    vertices: list[list[float]] = []
+    normals: list[list[float]] = []
+    indices: list[int] = []
+    for (r0, z0), (r1, z1) in pairwise(profile):
+        length = hypot(r1 - r0, z1 - z0)
+        flat = ((z1 - z0) / length, -(r1 - r0) / length)
+        first = len(vertices)
+        for k in range(SEGMENTS + 1):
+            c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
+            vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
+            normals += [[r * c, r * s, z] for r, z in ([(r0, z0), (r1, z1)] if round else [flat] * 2)]
+        for k in range(SEGMENTS):
+            a = first + 2 * k
+            indices += [a, a + 2, a + 1] if r0 > 0 else []
+            indices += [a + 1, a + 2, a + 3] if r1 > 0 else []
+    return Mesh(vertices, normals, indices)
