@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -61,12 +61,15 @@ class VotesConfig(CropConfig):
         channels: of the network at half resolution; below there are 2, 3 and 4 times as many.
         channels_full: at full resolution.
         min_votes: a smaller peak of the votes is no object.
+        memory: what a slot holds is updated from frame to frame, or else read afresh from each frame that shows it,
+            so that what looks alike is alike.
     """
 
     kind: Literal["votes"] = "votes"
     channels: int = 24
     channels_full: int = 16
     min_votes: float = 4.0
+    memory: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -329,12 +332,20 @@ class VotesParser(SceneParser):
         for frames_B3HW in frames_BT3HW.unbind(1):
             before = state
             attention_BKHW = self._divide(frames_B3HW, state, speed_BK2)
-            state, _ = self.corrector(frames_B3HW, _greet(state, frames_B3HW, attention_BKHW), attention_BKHW)
+            state = self._corrected(frames_B3HW, _greet(state, frames_B3HW, attention_BKHW), attention_BKHW)
             speed_BK2 = torch.where(before.is_thing, state.position - before.position, 0.0)
             slots.append(state.join())
             attentions.append(attention_BKHW)
         slots_BTKD = torch.stack(slots, 1)
         return Parsed(slots_BTKD, torch.stack(attentions, 1), slots_BTKD[:, :-1])
+
+    def _corrected(self, frames_B3HW: Tensor, state: SlotState, attention_BKHW: Tensor) -> SlotState:
+        if self.config.memory:
+            return self.corrector(frames_B3HW, state, attention_BKHW)[0]
+        blank = replace(state, content=torch.zeros_like(state.content))
+        read, _ = self.corrector(frames_B3HW, blank, attention_BKHW)
+        shown_BK1 = attention_BKHW.sum((2, 3))[..., None] >= self.corrector.min_pixels
+        return replace(read, content=torch.where(shown_BK1, read.content, state.content))
 
     def lesson_loss(self, frames_N3HW: Tensor, labels_NHW: Tensor) -> Tensor:
         logits_N3HW, votes_N3HW = self.network(frames_N3HW)
@@ -343,15 +354,20 @@ class VotesParser(SceneParser):
     @torch.no_grad()
     def _divide(self, frames_B3HW: Tensor, state: SlotState, speed_BK2: Tensor) -> Tensor:
         """What each slot covers (B, K, H, W), which sums to 1 over the slots."""
-        logits_B3HW, votes_B3HW = self.network(frames_B3HW)
+        # Votes are counted on the CPU: a GPU would wait for each of many small steps.
+        logits_B3HW, votes_B3HW = (part.cpu() for part in self.network(frames_B3HW))
+        slots, seen_B3HW, speeds_BK2 = (
+            SlotState(*(part.cpu() for part in vars(state).values())),
+            frames_B3HW.cpu(),
+            speed_BK2.cpu(),
+        )
         B, K = state.presence.shape[:2]
         slot_BHW = ROBOT_SLOT * (logits_B3HW.argmax(1) == ROBOT)
         for b in range(B):
             ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes)
-            one = SlotState(*(part[b].detach() for part in vars(state).values()))
-            slots_L = follow(ballot, frames_B3HW[b], one, speed_BK2[b].detach())
-            slot_BHW[b, ballot.y_L, ballot.x_L] = slots_L
-        return F.one_hot(slot_BHW, K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
+            one = SlotState(*(part[b] for part in vars(slots).values()))
+            slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], one, speeds_BK2[b])
+        return F.one_hot(slot_BHW.to(frames_B3HW.device), K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
 
     def _nothing(self, frames_B3HW: Tensor, K: int) -> SlotState:
         """Slots before anything is seen: the canvas, which fills the frame, and unused ones in its middle."""

@@ -13,8 +13,8 @@ from torch import Tensor
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.slots import SlotLayout, SlotState, moments
 
-ACTS = 0.07  # it acts when it gets further than this from its place, -1..1: two pixels of 64,
-TURNS = 1.0  # or when its content changes by so many of its deviations, in the mean square
+ACTS = 0.09  # it acts when it gets further than this from its place, -1..1: three pixels of 64,
+TURNS = 0.12  # or when its content changes by so many of its deviations, in the mean square
 REACHED = 0.07  # or when one that moves comes to rest so near to it
 MOVES = 0.015  # a slot moves when its centre shifts by more than this in a frame, -1..1: half a pixel of 64
 UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above

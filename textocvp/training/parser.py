@@ -65,6 +65,9 @@ class ParserTraining(ClipTraining):
     """Checkpoint with a parser that has been taught, which sees as it did there: only what its slots hold, and the
     renderer, are trained."""
 
+    start: Path | None = None
+    """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips."""
+
 
 class ParserStage(nn.Module):
     """What stage 1 trains, as one module, so that several processes can share its gradients."""
@@ -140,6 +143,8 @@ def train(args: ParserTraining) -> ParserMetrics | None:
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
         model = TextOCVP(config)
+    if args.start is not None:
+        go_on_from(model, args.start)
     if args.taught is not None:
         keep_taught(model, args.taught)
     model.to(accelerator.device)
@@ -185,6 +190,17 @@ def train(args: ParserTraining) -> ParserMetrics | None:
             print(f"not good enough to train a predictor on: {sentence}")
     close_run(accelerator)
     return metrics
+
+
+def go_on_from(model: TextOCVP, checkpoint: Path) -> None:
+    """Give parser and renderer the weights of a checkpoint; a SettingsError if it was built otherwise."""
+    source = TextOCVP.from_pretrained(str(checkpoint))
+    if (source.config.parser, source.config.renderer) != (model.config.parser, model.config.renderer):
+        raise SettingsError(
+            f"{checkpoint} is built otherwise: give the same preset and set as it was trained with"
+        )
+    model.parser.load_state_dict(source.parser.state_dict())
+    model.renderer.load_state_dict(source.renderer.state_dict())
 
 
 def keep_taught(model: TextOCVP, checkpoint: Path) -> None:

@@ -1,0 +1,255 @@
+"""Make everything that `experiments/cater.py` measures: the clips of CATER-hard, and every model of its tables.
+
+    python experiments/train_cater.py --list              # the commands, and what is done already
+    python experiments/train_cater.py                     # two cores: hours
+    python experiments/train_cater.py --scale gpu --jobs 8 --workers 14    # a GPU and 16 cores: minutes
+    python experiments/train_cater.py --scale toy         # a few updates of each, to see that all of it runs
+
+Each step is a command that can also be typed. Steps that need nothing of each other run side by side (`--jobs`). Stop
+at any moment and start again: finished steps are skipped, an unfinished one goes on where it was.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from joblib import Parallel, delayed
+
+from textocvp.data import open_episodes
+from textocvp.data.cache import cached_slots
+from textocvp.model import TextOCVP
+
+DONE = "done"
+SLOTS = {"slots-train": "train.h5", "slots-val": "val.h5"}  # as `textocvp train predictor` names them
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is made: clips, and the updates of each step with their batch."""
+
+    train: int
+    val: int
+    votes: tuple[int, int]
+    draw: tuple[int, int]
+    predictor: tuple[int, int]
+    outcome: tuple[int, int]
+    savi: tuple[int, int]
+    savi_clips: tuple[int, int]
+    savi_predictor: tuple[int, int]
+    vqvae: tuple[int, int]
+    mage: tuple[int, int]
+    evaluate: int = 20  # held-out clips
+
+
+SCALES = {
+    "toy": Scale(60, 16, (4, 4), (4, 4), (6, 4), (4, 4), (4, 2), (2, 2), (2, 2), (4, 2), (2, 2), 2),
+    "cpu": Scale(
+        2000, 120, (3000, 16), (1500, 16), (4000, 32), (3000, 64), (6000, 32), (400, 8), (800, 8), (1600, 16),
+        (1000, 8),
+    ),
+    "gpu": Scale(
+        5000, 120, (3000, 32), (1500, 16), (4000, 64), (3000, 128), (6000, 64), (1000, 24), (1500, 32),
+        (3000, 32), (2000, 32), 60,
+    ),
+}  # fmt: skip
+
+
+@dataclass
+class Args:
+    """Make the clips of CATER-hard and train every model on them."""
+
+    out: Path = Path("runs/cater")
+    """Folder of all of it."""
+    scale: Literal["toy", "cpu", "gpu"] = "cpu"
+    """How much: a few updates, what two cores do in a night, or what a GPU does in minutes."""
+    jobs: int = 1
+    """Steps side by side."""
+    workers: int = 2
+    """Processes that draw or parse clips."""
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Only these steps, with what they need."""
+    collector: str = sys.executable
+    """A Python with PyBullet, where this one has none."""
+    seed: int = 0
+    """Of weights and data order."""
+    parse: tuple[Path, Path] | None = None
+    """A checkpoint and a folder: only write the slots of all clips there, with so many processes."""
+    list: bool = False
+    """Print the commands and run none."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command."""
+
+    name: str
+    command: tuple[str, ...]
+    done: Path  # what is there when it has run
+    needs: tuple[str, ...] = ()
+    slots: Path | None = None  # where the slots of all clips are, for a run that learns from them
+
+
+def steps(args: Args) -> list[Step]:
+    """All of them, in an order in which they can run."""
+    out, scale = args.out, SCALES[args.scale]
+    data = ("--data", f"{out}/train.h5", "--val", f"{out}/val.h5")
+
+    def collect(split: str, episodes: int) -> Step:
+        path = out / f"{split}.h5"
+        options = ("--world", "cater", "--split", split, "--episodes", str(episodes), "--out", str(path))
+        workers = ("--workers", str(args.workers if split == "train" else 2))
+        return Step(split, (args.collector, "-m", "envs.collect", *options, *workers), path)
+
+    def train(name: str, kind: str, needs: str, size: tuple[int, int], *options: str) -> Step:
+        sizes = ("--steps", str(size[0]), "--batch", str(size[1]), "--seed", str(args.seed))
+        few = ("--evaluate-every", str(max(1, size[0] // 4)), "--evaluate-episodes", str(scale.evaluate))
+        command = (sys.executable, "-m", "textocvp.cli", "train", kind, *data, "--out", f"{out}/{name}")
+        linked = [one for one in needs.split() if "slots" in one]
+        return Step(
+            name,
+            (*command, *sizes, *few, *options),
+            out / name / "checkpoint",
+            ("train", "val", *needs.split()),
+            out / linked[0] if linked else None,
+        )
+
+    def slots(name: str, parser: str) -> Step:
+        checkpoint = f"{out}/{parser}/checkpoint"
+        command = (
+            sys.executable,
+            __file__,
+            "--parse",
+            checkpoint,
+            str(out / name),
+            "--workers",
+            str(args.workers),
+        )
+        return Step(name, (*command, "--out", str(out)), out / name / DONE, ("train", "val", parser))
+
+    reads = ("--workers", {"toy": "0", "cpu": "1", "gpu": "4"}[args.scale])
+    taught = ("--preset", "cater", "--clip", "1", "--learning-rate", "2e-3", "--warmup", "50", *reads)
+    never = ("--first-redraw", str(scale.votes[0]))
+    savi = ("--preset", "savi-cater", "--set", "parser.num_slots=10", *reads)
+    films = ("--autoregressive", "0.6", "--learning-rate", "1e-3")
+    cater = ("--parser", f"{out}/draw/checkpoint", *films)
+    plain = ("predictor.appearance=false", "text.kind=transformer")
+    color = ("predictor.appearance=false", "predictor.color_bias=true", "text.kind=lexicon")
+    return [
+        collect("train", scale.train),
+        collect("val", scale.val),
+        train("votes", "parser", "", scale.votes, *taught, *never),
+        train("votes-masks", "parser", "", scale.votes, *taught, *never, "--teacher", "masks"),
+        train("draw", "parser", "votes-masks", scale.draw, *taught, "--taught", f"{out}/votes-masks/checkpoint"),
+        slots("slots", "draw"),
+        train("predictor", "predictor", "slots", scale.predictor, *cater),
+        train("predictor-plain", "predictor", "slots", scale.predictor, *cater, "--set", *plain),
+        train("predictor-color", "predictor", "slots", scale.predictor, *cater, "--set", *color),
+        train("ocvp-seq", "predictor", "slots", scale.predictor, *cater, "--preset", "ocvp-seq-small", "--set",
+              "predictor.window=29"),
+        # Single frames first: slots bind to things before they follow them.
+        train("savi-stills", "parser", "", scale.savi, *savi, "--clip", "1", "--learning-rate", "4e-4"),
+        train("savi-parser", "parser", "savi-stills", scale.savi_clips, *savi, "--clip", "6", "--stride", "2",
+              "--start", f"{out}/savi-stills/checkpoint", "--learning-rate", "2e-4"),
+        slots("savi-slots", "savi-parser"),
+        train("savi-cater", "predictor", "savi-slots", scale.savi_predictor, "--parser",
+              f"{out}/savi-parser/checkpoint", "--preset", "savi-cater", "--learning-rate", "2e-4"),
+        train("vqvae", "vqvae", "", scale.vqvae),
+        train("mage", "mage", "vqvae", scale.mage, "--vqvae", f"{out}/vqvae/checkpoint", "--autoregressive", "0.8",
+              "--changed-weight", "1"),
+    ]  # fmt: skip
+
+
+def main(args: Args) -> int:
+    """Run what is missing; the exit status, 1 if a step failed (what does not need it runs all the same)."""
+    if args.parse is not None:
+        parse(args, *args.parse)
+        return 0
+    chosen = wanted(steps(args), args.only)
+    if args.list:
+        for step in chosen:
+            print(f"# {step.name}{' (done)' if step.done.exists() else ''}\n{shlex.join(step.command)}")
+        return 0
+    args.out.mkdir(parents=True, exist_ok=True)
+    states = {step.name: "done" if step.done.exists() else "waits" for step in chosen}
+    began, running = time.monotonic(), dict[Future[bool], Step]()
+    with ThreadPoolExecutor(args.jobs) as pool:
+        while True:
+            for step in chosen:
+                if states[step.name] == "waits" and any(states[one] == "failed" for one in step.needs):
+                    states[step.name] = "failed"
+                ready = states[step.name] == "waits" and all(states[one] == "done" for one in step.needs)
+                if ready and len(running) < args.jobs:
+                    states[step.name] = "runs"
+                    running[pool.submit(run, step, args.out)] = step
+                    print(f"{time.monotonic() - began:6.0f} s  {step.name} begins", flush=True)
+            if not running:
+                break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                step = running.pop(future)
+                states[step.name] = "done" if future.result() else "failed"
+                print(f"{time.monotonic() - began:6.0f} s  {step.name} {states[step.name]}", flush=True)
+    return int("failed" in states.values())
+
+
+def wanted(found: Sequence[Step], only: Sequence[str]) -> list[Step]:
+    """The steps of these names (all by default), and those that they need.
+
+    Raises:
+        ValueError: if there is no such step.
+    """
+    known = {step.name: step for step in found}
+    names = list(only) or list(known)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no step {name!r}: {', '.join(known)}")
+        names += [one for one in known[name].needs if one not in names]
+    return [step for step in found if step.name in names]
+
+
+def run(step: Step, out: Path) -> bool:
+    """Run one step, its output in `out`/NAME.log; whether it ended well."""
+    if step.slots is not None:
+        folder = out / step.name
+        folder.mkdir(exist_ok=True)
+        for name in SLOTS:
+            if not (folder / name).exists():
+                (folder / name).symlink_to((step.slots / name).absolute())
+    with open(out / f"{step.name}.log", "ab") as log:
+        ended = subprocess.run(step.command, stdout=log, stderr=log, check=False).returncode
+    return ended == 0 and step.done.exists()
+
+
+def parse(args: Args, checkpoint: Path, folder: Path) -> None:
+    """Write the slots of all clips, with several processes: a parser that looks at pixels one by one is slow."""
+    for name, file in SLOTS.items():
+        jobs = (
+            delayed(_parse)(checkpoint, args.out / file, folder / name, i, args.workers)
+            for i in range(args.workers)
+        )
+        Parallel(n_jobs=args.workers)(jobs)
+    (folder / DONE).touch()
+
+
+def _parse(checkpoint: Path, data: Path, folder: Path, process: int, processes: int) -> None:
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // processes))
+    with open_episodes(data) as episodes:
+        model = TextOCVP.from_pretrained(str(checkpoint)).eval()
+        cached_slots(model, episodes, folder, process, processes)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(tyro.cli(Args, description=__doc__)))
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"error: {error}") from None
