@@ -141,6 +141,7 @@ def steps(args: Args) -> list[Step]:
     taught = ("--preset", "cater", "--clip", "1", "--learning-rate", "2e-3", "--warmup", "50", *reads)
     never = ("--first-redraw", str(scale.votes[0]))
     savi = ("--preset", "savi-cater", "--set", "parser.num_slots=10", *reads)
+    fast = ("--precision", "bf16") if args.scale == "gpu" else ()
     films = ("--autoregressive", "0.6", "--learning-rate", "1e-3")
     cater = ("--parser", f"{out}/draw/checkpoint", *films)
     plain = ("predictor.appearance=false", "text.kind=transformer")
@@ -158,12 +159,12 @@ def steps(args: Args) -> list[Step]:
         train("ocvp-seq", "predictor", "slots", scale.predictor, *cater, "--preset", "ocvp-seq-small", "--set",
               "predictor.window=29"),
         # Single frames first: slots bind to things before they follow them.
-        train("savi-stills", "parser", "", scale.savi, *savi, "--clip", "1", "--learning-rate", "4e-4"),
-        train("savi-parser", "parser", "savi-stills", scale.savi_clips, *savi, "--clip", "6", "--stride", "2",
+        train("savi-stills", "parser", "", scale.savi, *savi, *fast, "--clip", "1", "--learning-rate", "4e-4"),
+        train("savi-parser", "parser", "savi-stills", scale.savi_clips, *savi, *fast, "--clip", "6", "--stride", "2",
               "--start", f"{out}/savi-stills/checkpoint", "--learning-rate", "2e-4"),
         slots("savi-slots", "savi-parser"),
         train("savi-cater", "predictor", "savi-slots", scale.savi_predictor, "--parser",
-              f"{out}/savi-parser/checkpoint", "--preset", "savi-cater", "--learning-rate", "2e-4"),
+              f"{out}/savi-parser/checkpoint", "--preset", "savi-cater", "--learning-rate", "2e-4", *fast),
         train("vqvae", "vqvae", "", scale.vqvae),
         train("mage", "mage", "vqvae", scale.mage, "--vqvae", f"{out}/vqvae/checkpoint", "--autoregressive", "0.8",
               "--changed-weight", "1"),

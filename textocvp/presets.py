@@ -120,7 +120,7 @@ CLIPORT = ModelConfig(
 # CATER-hard on CPUs: background, a place for a robot that is not there, at most 8 things, and one to spare.
 CATER = ModelConfig(
     name="cater",
-    parser=VotesConfig(num_slots=11, memory=False),
+    parser=VotesConfig(num_slots=11, peak_radius=3.0, memory=False),
     renderer=RecallConfig(),
     text=WordsConfig(kind="transformer"),
     predictor=replace(SMALL, window=29, appearance=True),

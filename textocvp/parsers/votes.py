@@ -35,7 +35,6 @@ SIZE_UNIT = (
 # In that unit: smaller radii than this are alike, for a half hidden block is one block, not two.
 SMALLEST = 14.3
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
-PEAK_RADIUS = 5.0  # pixels within which there is no second object
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
@@ -61,6 +60,7 @@ class VotesConfig(CropConfig):
         channels: of the network at half resolution; below there are 2, 3 and 4 times as many.
         channels_full: at full resolution.
         min_votes: a smaller peak of the votes is no object.
+        peak_radius: pixels of votes within which there is no second object.
         memory: what a slot holds is updated from frame to frame, or else read afresh from each frame that shows it,
             so that what looks alike is alike.
     """
@@ -69,6 +69,7 @@ class VotesConfig(CropConfig):
     channels: int = 24
     channels_full: int = 16
     min_votes: float = 4.0
+    peak_radius: float = 5.0
     memory: bool = True
 
     def __post_init__(self) -> None:
@@ -211,12 +212,15 @@ class Ballot:
         return _apart(self.votes_L3, candidates_C3).argmin(1)
 
 
-def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: float = 4.0) -> Ballot:
+def count_votes(
+    logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: float = 4.0, peak_radius: float = 5.0
+) -> Ballot:
     """Find where the votes of object pixels are densest.
 
     Args:
         most: how many objects a frame can have at most.
         min_votes: an object has at least so many votes within `VOTE_SPREAD` or so.
+        peak_radius: as in `VotesConfig`.
     """
     y_L, x_L = (logits_3HW.argmax(0) == OBJECT).nonzero(as_tuple=True)
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
@@ -231,7 +235,7 @@ def count_votes(logits_3HW: Tensor, votes_3HW: Tensor, most: int, min_votes: flo
     peaks: list[int] = []
     while len(peaks) < most and len(some_S3) and density_S.max() > 0:
         peaks.append(int(density_S.argmax()))
-        density_S = density_S.masked_fill(near_SS[peaks[-1]] < PEAK_RADIUS, 0.0)
+        density_S = density_S.masked_fill(near_SS[peaks[-1]] < peak_radius, 0.0)
     return Ballot(y_L, x_L, votes_L3, some_S3[peaks])
 
 
@@ -246,12 +250,15 @@ def _pixels_of(votes_N3: Tensor) -> Tensor:
     return 6 * (2 / SIZE_UNIT * votes_N3[:, 2]).exp()
 
 
-def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor) -> Tensor:
+def follow(
+    ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, peak_radius: float = 5.0
+) -> Tensor:
     """The slot (L,) of each of one frame's object pixels, by place, colour and size.
 
     Args:
         state: slots (K,) of the frame before.
         speed_K2: how far they moved in it.
+        peak_radius: as in `VotesConfig`.
     """
     (H, W), P = frame_3HW.shape[1:], len(ballot.peaks_P3)
     if P == 0:
@@ -292,7 +299,7 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     radius_M = (state.scale * state.scale.new_tensor([W / 2, H / 2])).norm(dim=-1)[missing]
     center_M2 = (state.position[missing] + 1) * state.position.new_tensor([W / 2, H / 2]) - 0.5
     known_M3 = torch.cat([center_M2, SIZE_UNIT * radius_M.log()[:, None]], 1)
-    votes_M = (_apart(known_M3, ballot.votes_L3) < PEAK_RADIUS).sum(1)
+    votes_M = (_apart(known_M3, ballot.votes_L3) < peak_radius).sum(1)
     there = (votes_M >= MIN_SHARE * _pixels_of(known_M3).clamp_min(MIN_AREA)).cpu().numpy()
     candidates_C3 = torch.cat([ballot.peaks_P3, known_M3[there]])
     owner_C = torch.as_tensor(np.concatenate([owner_P, missing[there]]), device=winner_L.device)
@@ -364,9 +371,12 @@ class VotesParser(SceneParser):
         B, K = state.presence.shape[:2]
         slot_BHW = ROBOT_SLOT * (logits_B3HW.argmax(1) == ROBOT)
         for b in range(B):
-            ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes)
+            radius = self.config.peak_radius
+            ballot = count_votes(
+                logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes, radius
+            )
             one = SlotState(*(part[b] for part in vars(slots).values()))
-            slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], one, speeds_BK2[b])
+            slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], one, speeds_BK2[b], radius)
         return F.one_hot(slot_BHW.to(frames_B3HW.device), K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
 
     def _nothing(self, frames_B3HW: Tensor, K: int) -> SlotState:
