@@ -83,8 +83,7 @@ class CaterEpisodes(Episodes):
         except Exception as error:  # decoders raise whatever they like
             raise ValueError(f"{video}: it cannot be read ({str(error).splitlines()[0][:120]})") from error
         if len(frames) != wanted:
-            hint = "an import leaves such videos out"
-            raise ValueError(f"{video}: damaged, {len(frames)} of {wanted} frames can be read; {hint}")
+            raise ValueError(f"{video}: damaged, {len(frames)} of {wanted} frames; an import leaves it out")
         return frames
 
     def truth(self, index: int) -> Truth | None:
@@ -99,10 +98,10 @@ class CaterEpisodes(Episodes):
     def _clip(self, number: str, entry: Any) -> tuple[Path, str, int, tuple[int, int]]:
         """Video, caption, frames, and width and height of an entry of the list, if all is there and whole."""
         name, caption = (entry.get(key) if isinstance(entry, dict) else None for key in ("video", "caption"))
-        if not isinstance(name, str) or not name:
+        if not (isinstance(name, str) and name):
             raise ValueError(f"{self.path}: entry {number} has no video")
         video = self.path.parent / name
-        if not isinstance(caption, str) or not caption.strip():
+        if not (isinstance(caption, str) and caption.strip()):
             raise ValueError(f"{video}: {self.path.name} has no caption for it")
         count, W, H = _look(video)
         if count < 2:

@@ -143,11 +143,9 @@ def import_videos(
         if positions:
             file["episode/objects"] = objects
             room = max(8, *(one.shape[1] for one in positions))
-            wide = [((0, 0), (0, room - one.shape[1]), (0, 0)) for one in positions]
-            padded = [
-                np.pad(one, to, constant_values=np.nan) for one, to in zip(positions, wide, strict=True)
-            ]
-            file["object_position"] = np.concatenate(padded)
+            placed = file.create_dataset("object_position", (sum(lengths), room, 3), "f4", fillvalue=np.nan)
+            for start, one in zip(file["episode/start"], positions, strict=True):
+                placed[start : start + len(one), : one.shape[1]] = one
     done.episodes, done.frames = len(lengths), sum(lengths)
     return done
 
