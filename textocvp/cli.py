@@ -138,7 +138,8 @@ class ImportCommand:
     """Make an episode file of a folder of videos, or of folders of pictures, with a sentence each."""
 
     source: tyro.conf.Positional[Path]
-    """Folder with the videos, and captions.json, captions.csv or captions.txt: name and sentence of each."""
+    """Folder with the videos, and captions.json, captions.csv or captions.txt: name and sentence of each. Or
+    CATER-GEN-v2's list of captions, such as FOLDER/train_explicit.json."""
     out: Path
     """The episode file."""
     size: int = 64
@@ -154,7 +155,7 @@ class DescribeCommand:
     """Say what an episode file holds."""
 
     file: tyro.conf.Positional[Path]
-    """The file, or a folder of CLIPort's npz files."""
+    """The file, a folder of CLIPort's npz files, or CATER-GEN-v2's list of captions."""
 
 
 @dataclass
@@ -162,7 +163,7 @@ class CheckCommand:
     """Say what is wrong in an episode file; exit status 1 if anything is."""
 
     file: tyro.conf.Positional[Path]
-    """The file, or a folder of CLIPort's npz files."""
+    """The file, a folder of CLIPort's npz files, or CATER-GEN-v2's list of captions."""
     window: int | None = None
     """Frames that the predictor to be trained looks ahead (24 by default there)."""
 
@@ -172,7 +173,7 @@ class PreviewCommand:
     """Draw moments of the first episodes, a row each, and print their sentences."""
 
     file: tyro.conf.Positional[Path]
-    """The file, or a folder of CLIPort's npz files."""
+    """The file, a folder of CLIPort's npz files, or CATER-GEN-v2's list of captions."""
     out: Path = Path("preview.png")
     """Where to."""
 
@@ -295,14 +296,18 @@ def _train(arguments: list[str]) -> None:
 
 def _data(arguments: list[str]) -> int:
     from textocvp.data import open_episodes, own_videos
+    from textocvp.data.cater import CaterEpisodes
 
     action: Any = tyro.cli(
         DataAction, prog="textocvp data", description="Episode files of your own videos.", args=arguments
     )
     try:
         if isinstance(action, ImportCommand):
+            source: Any = action.source
+            if CaterEpisodes.detect(source):
+                source = CaterEpisodes(source, size=action.size, crop=action.crop)
             done = own_videos.import_videos(
-                action.source, action.out, size=action.size, crop=action.crop, every=action.every
+                source, action.out, size=action.size, crop=action.crop, every=action.every
             )
             for line in done.left_out:
                 print(f"left out: {line}", file=sys.stderr)

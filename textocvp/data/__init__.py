@@ -6,12 +6,14 @@ Another format is a subclass of `Episodes` in a file of its own, and a line in `
 import os
 from pathlib import Path
 
+from textocvp.data.cater import CaterEpisodes
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import EpisodeFile, Episodes
 
 FORMATS: dict[str, type[Episodes]] = {
     "hdf5": EpisodeFile,
     "cliport": CliportEpisodes,
+    "cater": CaterEpisodes,
 }
 """Every format by name, in the order in which they are tried."""
 

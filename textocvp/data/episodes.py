@@ -30,6 +30,8 @@ class EpisodeObject(NamedTuple):
     label: int
     kind: str
     color: str
+    size: str = ""
+    material: str = ""
 
 
 class Question(NamedTuple):
@@ -89,12 +91,14 @@ class Episodes(ABC):
         image_size: height and width of the frames, in pixels.
         lengths: (E,) frames of each episode.
         instructions: the E sentences.
+        problems: a line for each file that was left out.
     """
 
     path: Path
     image_size: int
     lengths: NDArray[np.int64]
     instructions: tuple[str, ...]
+    problems: tuple[str, ...] = ()
 
     @abstractmethod
     def __init__(self, path: str | os.PathLike[str], first: int | None = None) -> None:
@@ -272,7 +276,10 @@ class EpisodeFile(Episodes):
         questions: tuple[Question, ...] = ()
         if self._version == 1:
             items = [{"id": id, "label": FIRST_OBJECT + id, **item} for id, item in enumerate(items)]
-        objects = tuple(EpisodeObject(*(item[name] for name in EpisodeObject._fields)) for item in items)
+        names = EpisodeObject._fields
+        objects = tuple(
+            EpisodeObject(**{name: item[name] for name in names if name in item}) for item in items
+        )
         if self._version > 1:
             robot = json.loads(file.attrs.get("labels", "{}")).get("robot")
             questions = tuple(Question(**item) for item in self._json("questions", number))
@@ -385,5 +392,5 @@ def swapped_questions(
 
 
 def words_of(sentences: Iterable[str]) -> set[str]:
-    """All words of some sentences, lower case."""
+    """All words of some sentences, lower case; -3 is one."""
     return {word for sentence in set(sentences) for word in split(sentence)}

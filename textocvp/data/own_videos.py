@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from tqdm import tqdm
 
-from textocvp.data.episodes import Episodes, words_of
+from textocvp.data.episodes import Episode, Episodes, words_of
 from textocvp.files import replacing
 from textocvp.pictures import read_picture
 
@@ -69,10 +70,13 @@ def read_captions(folder: Path) -> dict[str, str]:
     return {name.strip(): " ".join(sentence.split()) for name, sentence in found.items()}
 
 
-def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False, every: int = 1) -> Imported:
+def import_videos(
+    source: Path | Episodes, out: Path, *, size: int = 64, crop: bool = False, every: int = 1
+) -> Imported:
     """Write an episode file of the videos in a folder: video files, and folders of pictures in the order of names.
 
     Args:
+        source: the folder; or episodes of another format, whose frames have their size, with objects and positions.
         size: height and width of the frames in the file; pictures of other shapes get a border.
         crop: cut off what does not fit the square instead.
         every: take every so many frames.
@@ -80,12 +84,21 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
     Raises:
         OwnVideosError: if there is no video, no captions, or no video that can be used; nothing is written then.
     """
-    if not source.is_dir():
+    if isinstance(source, Path) and not source.is_dir():
         raise OwnVideosError(f"{source} is no folder of videos")
     if size < 8 or every < 1:
         raise OwnVideosError(f"size must be at least 8 and every at least 1, not {size} and {every}")
-    captions, done = read_captions(source), Imported()
-    videos = [one for one in sorted(source.iterdir()) if one.suffix.lower() in VIDEOS or one.is_dir()]
+    done = Imported()
+    videos: dict[str, Callable[[], Episode]]
+    if isinstance(source, Episodes):
+        size = source.image_size
+        videos = {f"episode {i}": partial(source.episode, i) for i in range(len(source))}
+        captions = dict(zip(videos, source.instructions, strict=True))
+    else:
+        captions = read_captions(source)
+        found = [one for one in sorted(source.iterdir()) if one.suffix.lower() in VIDEOS or one.is_dir()]
+        videos = {one.name: partial(_own_episode, one, size, crop, every) for one in found}
+        every = 1  # they take it themselves
     if not videos:
         raise OwnVideosError(f"{source} has no video ({', '.join(VIDEOS)}) and no folder of pictures")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -96,24 +109,30 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
         )
         lengths: list[int] = []
         sentences: list[str] = []
-        for path in tqdm(videos, desc="videos", unit="video"):
-            sentence = captions.get(path.name) or captions.get(path.stem)
+        objects: list[str] = []
+        positions: list[NDArray[np.float32]] = []
+        for name, read in tqdm(videos.items(), desc="videos", unit="video"):
+            sentence = captions.get(name) or captions.get(Path(name).stem)
             if not sentence:
-                done.left_out.append(f"{path.name}: the captions have no sentence for it")
+                done.left_out.append(f"{name}: the captions have no sentence for it")
                 continue
             try:
-                video = _read_video(path, size, crop, every)
+                clip = read()
             except Exception as error:  # decoders raise whatever they like
-                done.left_out.append(f"{path.name}: it cannot be read ({str(error).splitlines()[0][:120]})")
+                done.left_out.append(f"{name}: it cannot be read ({str(error).splitlines()[0][:300]})")
                 continue
+            video = clip.frames[::every]
             if len(video) < 2:
-                done.left_out.append(f"{path.name}: {len(video)} frames, and an episode needs at least 2")
+                done.left_out.append(f"{name}: {len(video)} frames, and an episode needs at least 2")
                 continue
             frames.resize(len(frames) + len(video), axis=0)
             frames[-len(video) :] = video
             lengths.append(len(video))
             sentences.append(sentence)
-        known = {name for path in videos for name in (path.name, path.stem)}
+            if clip.position is not None:
+                objects.append(json.dumps([one._asdict() for one in clip.objects]))
+                positions.append(clip.position[::every])
+        known = {*videos, *(Path(name).stem for name in videos)}
         done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
         if not lengths:
             raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
@@ -121,11 +140,22 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
         file["episode/start"] = np.cumsum(lengths) - lengths
         file["episode/length"] = np.array(lengths)
         file["episode/instruction"] = sentences
+        if positions:
+            file["episode/objects"] = objects
+            room = max(8, *(one.shape[1] for one in positions))
+            placed = file.create_dataset("object_position", (sum(lengths), room, 3), "f4", fillvalue=np.nan)
+            for start, one in zip(file["episode/start"], positions, strict=True):
+                placed[start : start + len(one), : one.shape[1]] = one
     done.episodes, done.frames = len(lengths), sum(lengths)
     return done
 
 
-def _read_video(path: Path, size: int, crop: bool, every: int) -> NDArray[np.uint8]:
+def _own_episode(path: Path, size: int, crop: bool, every: int) -> Episode:
+    return Episode(frames=read_video(path, size, crop, every), instruction="")
+
+
+def read_video(path: Path, size: int, crop: bool, every: int) -> NDArray[np.uint8]:
+    """Square frames (T, size, size, 3) as `import_videos` takes them; raises whatever the decoder does."""
     if path.is_dir():
         files = sorted((one for one in path.iterdir() if one.suffix.lower() in PICTURES), key=_by_number)[
             ::every
@@ -177,11 +207,15 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
     Args:
         window: frames that the predictor to be trained can look ahead.
     """
-    found = []
+    found, damaged = [], list(episodes.problems)
     if len(episodes) < 4:
         found.append(f"{len(episodes)} episodes: figures over fewer than 4 say little")
     for index, text in enumerate(episodes.instructions):
-        frames = episodes.frames(index)
+        try:
+            frames = episodes.frames(index)
+        except (OSError, ValueError) as error:
+            damaged.append(str(error))
+            continue
         here = f"episode {index} ({text!r})"
         if not any(letter.isalpha() for letter in text):
             found.append(f"{here}: the sentence has no words")
@@ -195,6 +229,9 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
             found.append(
                 f"{here}: {len(frames)} frames; the predictor looks {window} ahead: take --every, or a wider window"
             )
+    if damaged:
+        total = len(episodes) + len(episodes.problems)
+        found = [f"{len(damaged)} of {total} episodes cannot be used:", *damaged, *found]
     return found
 
 

@@ -167,7 +167,9 @@ class _Squares(Episodes):
 def test_another_format_is_a_class_and_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tmp_path / "my.squares"
     source.write_text("one two\nthree four five\nsix")
-    with pytest.raises(ValueError, match=r"not an episode file, nor of another format \(hdf5, cliport\)"):
+    with pytest.raises(
+        ValueError, match=r"not an episode file, nor of another format \(hdf5, cliport, cater\)"
+    ):
         open_episodes(source)
     monkeypatch.setitem(FORMATS, "squares", _Squares)
     with open_episodes(source, first=2) as file:
