@@ -275,7 +275,7 @@ def _free(clip: Clip) -> bool:
     wide = radii[:, None] + radii + GAP
     inside = {(act.thing, act.into) for act in clip.acts if act.into is not None}
     moving = sorted(act.thing for act in clip.acts)
-    for frame in range(0, FRAMES + 1, 2):
+    for frame in range(FRAMES + 1):
         centers, _ = clip.poses(frame)
         for k in moving:
             off = np.abs(centers - centers[k])

@@ -20,8 +20,8 @@ CAMERA = CameraPreset(eye=EYE, target=(0.0, 0.0, 0.2), fov=42.0, near=5.0, far=4
 OVERSAMPLING = 2  # pixels of a frame average so many drawn ones along each axis
 FLOOR = 165.0  # gray of the floor, 0..255
 LIGHT = (3.0, -1.0, 6.0)  # from where it comes; jittered by up to 1 in each direction
-AMBIENT, DIFFUSE, SPECULAR = 0.55, 0.45, 2.0
-SHINE = {"rubber": 0.05, "metal": 0.9}
+AMBIENT, DIFFUSE = 0.55, 0.45
+SHINE = {"rubber": 0.1, "metal": 2.0}  # how much light is reflected as by a mirror
 VIGNETTE = 0.2  # how much darker a corner of the floor is
 SHADE, SOFT = 0.3, 0.012  # how much darker a shadow is, and how wide its border, in sides of the frame
 SEGMENTS = 20  # corners of a circle
@@ -51,21 +51,14 @@ class Table:
         for body, center, turn in zip(self.bodies, centers, turns, strict=True):
             self.bullet.resetBasePositionAndOrientation(body, center.tolist(), turn.tolist())
         n, many = self.camera.size, OVERSAMPLING
-        size = n * many
-        _, _, rgba, _, bodies = self.bullet.getCameraImage(
-            size,
-            size,
-            self.camera.view_matrix,
-            self.camera.projection_matrix,
-            lightDirection=self.light.tolist(),
-            lightAmbientCoeff=AMBIENT,
-            lightDiffuseCoeff=DIFFUSE,
-            lightSpecularCoeff=SPECULAR,
-            shadow=0,
-            renderer=p.ER_TINY_RENDERER,
-        )
-        bodies = np.asarray(bodies).reshape(size, size)
-        things = np.asarray(rgba, np.uint8).reshape(size, size, 4)[..., :3]
+        # PyBullet's renderer knows one shine for all, so there is a picture for each material.
+        materials = sorted({thing.material for thing in self.clip.things})
+        things, bodies = self._draw(materials[0])
+        if len(materials) > 1:
+            other, _ = self._draw(materials[1])
+            of_other = np.zeros(max(self.bodies) + 2, bool)
+            of_other[np.array(self.bodies) + 1] = [t.material == materials[1] for t in self.clip.things]
+            things = np.where(of_other[bodies + 1][..., None], other, things)
         floor = self._floor(centers, turns)
         drawn = np.where(bodies[..., None] < 0, floor[..., None], things)
         image = drawn.reshape(n, many, n, many, 3).mean((1, 3), dtype=np.float32)
@@ -74,6 +67,24 @@ class Table:
         # Of an even number of drawn pixels one has the corner that TinyRenderer samples in the middle.
         seen = labels[bodies[(many - 1) // 2 :: many, many // 2 :: many] + 1]
         return (image + 0.5).astype(np.uint8), seen
+
+    def _draw(self, material: str) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """All things as if they were of this material (S, S, 3), and the bodies (S, S) that the pixels show, or -1."""
+        size = self.camera.size * OVERSAMPLING
+        _, _, rgba, _, bodies = self.bullet.getCameraImage(
+            size,
+            size,
+            self.camera.view_matrix,
+            self.camera.projection_matrix,
+            lightDirection=self.light.tolist(),
+            lightAmbientCoeff=AMBIENT,
+            lightDiffuseCoeff=DIFFUSE,
+            lightSpecularCoeff=SHINE[material],
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+        )
+        drawn = np.asarray(rgba, np.uint8).reshape(size, size, 4)[..., :3]
+        return drawn, np.asarray(bodies, np.int64).reshape(size, size)
 
     def _floor(self, centers: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
         """The floor (S, S) with the things' shadows, each the outline of what it hides from the light."""
@@ -97,10 +108,7 @@ class Table:
 
     def _add(self, thing: Thing) -> int:
         r = thing.radius
-        look = {
-            "rgbaColor": [*(value / 255 for value in thing.rgb), 1.0],
-            "specularColor": [SHINE[thing.material]] * 3,
-        }
+        look = {"rgbaColor": [*(value / 255 for value in thing.rgb), 1.0]}
         if thing.shape == "cube":
             half = [r / 2**0.5] * 3
             shape = self.bullet.createVisualShape(p.GEOM_BOX, halfExtents=half, **look)

@@ -168,6 +168,14 @@ METHODS: dict[str, Method] = {
             privileged=True,
         ),
         Method(
+            key="savi",
+            kind="baseline",
+            hue=7,
+            note="published slot attention from pixels, and text",
+            model="savi-cater-trained",
+            train="python experiments/train_cater.py --only savi-cater",
+        ),
+        Method(
             key="OCVP-Seq",
             kind="baseline",
             hue=5,
