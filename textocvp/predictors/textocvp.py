@@ -55,6 +55,8 @@ class TextOCVPPredictor(SlotPredictor):
 
     def __init__(self, config: TextOCVPConfig, layout: SlotLayout, text_dim: int) -> None:
         super().__init__(config, layout, text_dim)
+        if config.appearance and not layout.explicit:
+            raise ValueError("predictor.appearance needs slots with explicit places: set it to false")
         self.appearance = Appearance(layout, text_dim) if config.appearance else None
 
     def _layer(self, text_dim: int) -> nn.Module:

@@ -86,7 +86,10 @@ def backdrop(frames_THW3: NDArray[np.uint8]) -> Backdrop:
     median_HW3 = np.median(frames_THW3, axis=0).astype(np.float32)
     tones_N3 = background_tones(median_HW3)
     near_HW = (np.abs(median_HW3[:, :, None] - tones_N3).max(-1) <= TONE_RADIUS).any(-1)
-    return Backdrop(tones_N3, None if near_HW.mean() >= FLAT else _floor(median_HW3))
+    # Several tones that follow each other are one surface in uneven light.
+    steps = np.diff(np.sort(tones_N3.mean(-1)))
+    uneven = len(steps) > 1 and steps.max() <= 4 * TONE_RADIUS
+    return Backdrop(tones_N3, _floor(median_HW3) if uneven or near_HW.mean() < FLAT else None)
 
 
 def _floor(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:

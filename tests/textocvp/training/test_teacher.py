@@ -132,3 +132,23 @@ def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.Mon
         train(parser_run(folder, "other", preset="tabletop-small", taught=lesson.out / "checkpoint"))
     with pytest.raises(SettingsError, match="has another network"):
         train(replace(taken, out=folder / "wide", set=("parser.channels=8",)))
+
+
+def test_on_a_floor_in_uneven_light_shadows_are_floor_and_gray_things_are_not() -> None:
+    y, x = np.mgrid[-1 : 1 : 48j, -1 : 1 : 48j]
+    floor = 165 * (1 - 0.1 * (x**2 + y**2))
+    frames = np.repeat(floor[None, ..., None], 3, 3).repeat(6, 0)
+    labels = np.zeros((6, 48, 48), int)
+    for t in range(6):
+        frames[t, 30:36, 4 + 3 * t : 14 + 3 * t] *= 0.75  # the shadow of what moves
+        for label, top, left, color in ((1, 20, 6 + 3 * t, (190, 40, 40)), (2, 8, 34, (60, 60, 60))):
+            labels[t, top : top + 8, left : left + 8] = label
+            frames[t, top : top + 8, left : left + 8] = color
+    frames = frames.round().astype(np.uint8)
+    behind = backdrop(frames)
+    assert behind.floor_HW is not None and np.abs(behind.floor_HW - floor).max() < 2
+    found = video_masks(frames, behind)
+    assert np.array_equal(found > 0, labels > 0)
+    for mine, truth in zip(found, labels, strict=True):
+        assert [len(np.unique(mine[truth == label])) for label in (1, 2)] == [1, 1]
+        assert len(np.unique(mine)) == 3 and not (mine == 1).any()  # no robot
