@@ -53,10 +53,10 @@ def state_vector(gripper: Floats, position: Floats, objects: tuple[ObjectSpec, .
 def goal_vectors(task: Task, world: Tabletop, robot: Robot, scene: Scene) -> dict[str, Floats]:
     """The observations of `goal_sizes`.
 
-    `achieved_goal` and `desired_goal` have 8 rows, by id, and last the tip's place or where it rests. The row of a
+    `achieved_goal` and `desired_goal` have 8 rows, by id, and last the tip's place, or where it rests. The row of a
     thing that the goal names says what is, or shall be, true of it (one number for the table, then one for each
-    relation to each id), and where it is, or shall end. The other rows are 0. `goal` has 8 rows of what shall be true,
-    where the thing is, and where it shall end: all that a policy needs to know of the goal.
+    relation to each id), and where it is, or shall end. `goal` has 8 rows of what shall be true and is not yet, where
+    the thing is, and where it shall end: all that a policy needs to know of the goal. Other rows are 0.
     """
     facts = 1 + len(task.relations) * MAX_OBJECTS
     names = ["", *(relation.name for relation in task.relations)]
@@ -65,6 +65,7 @@ def goal_vectors(task: Task, world: Tabletop, robot: Robot, scene: Scene) -> dic
         return 0 if pair.target == TABLE else 1 + pair.target + MAX_OBJECTS * (names.index(pair.relation) - 1)
 
     achieved, desired = np.zeros((2, MAX_OBJECTS, facts + 3))
+    goal = np.zeros((MAX_OBJECTS, facts + 6))
     asked = task.asked(scene)
     for pair in task.true_of(world, robot, scene, {pair.thing for pair in asked}):
         achieved[pair.thing, column(pair)] = 1
@@ -72,7 +73,9 @@ def goal_vectors(task: Task, world: Tabletop, robot: Robot, scene: Scene) -> dic
         achieved[pair.thing, column(pair)], desired[pair.thing, column(pair)] = fulfilled, 1
         achieved[pair.thing, facts:] = _clipped(world.pose(pair.thing)[0])
         desired[pair.thing, facts:] = _clipped(task.destination(world, scene, pair))
-    goal = np.hstack([desired[:, :facts], achieved[:, facts:], desired[:, facts:]])
+        if not fulfilled:
+            row = desired[pair.thing]
+            goal[pair.thing] = np.concatenate([row[:facts], achieved[pair.thing, facts:], row[facts:]])
     return {
         "achieved_goal": np.append(achieved, _clipped(robot.tip())).astype(np.float32),
         "desired_goal": np.append(desired, _clipped(robot.arm.home)).astype(np.float32),
