@@ -148,30 +148,30 @@ def test_compute_reward_is_the_reward_of_a_step(make: Make, env_id: str, control
     env = make(env_id, image_size=16, extras=NUMBERS, control=control, reward=reward)
     plain = make(env_id, image_size=16, control=control)
     again = env.unwrapped.compute_reward
-    for seed in range(2):
-        for policy in ("expert", "random"):
-            observation, _ = env.reset(seed=seed)
-            plain.reset(seed=seed)
-            env.action_space.seed(seed)
-            before, steps, played = observation["achieved_goal"], [], []
-            actions = Expert(env).actions() if policy == "expert" else anything(env, 6)
-            for step in episode(env, (played.append(action) or action for action in actions)):
-                observation, value, terminated, _, info = step
-                assert np.array_equal(info[BEFORE], before)
-                before = observation["achieved_goal"]
-                assert again(observation["achieved_goal"], observation["desired_goal"], info) == value
-                steps.append((observation["achieved_goal"], observation["desired_goal"], info, value))
-                if reward == "dense":
-                    assert value <= 0 and (value == 0 or not info["is_success"])
-                    assert value == 0 or not terminated
-                    assert (value == 0) == all(env.unwrapped._fulfilled())
-            achieved, desired, infos, values = zip(*steps, strict=True)
-            batch = again(np.array(achieved), np.array(desired), np.array(infos))
-            assert batch.tolist() == list(values)
-            if reward == "sparse":  # the same as without the extras
-                assert values == tuple(step[1] for step in episode(plain, iter(played)))
-            if policy == "expert":
-                assert terminated and (sum(values) > 0 if reward == "sparse" else value == 0)
+    seed = REWARDS.index(reward)
+    for policy in ("expert", "random"):
+        observation, _ = env.reset(seed=seed)
+        plain.reset(seed=seed)
+        env.action_space.seed(seed)
+        before, steps, played = observation["achieved_goal"], [], []
+        actions = Expert(env).actions() if policy == "expert" else anything(env, 6)
+        for step in episode(env, (played.append(action) or action for action in actions)):
+            observation, value, terminated, _, info = step
+            assert np.array_equal(info[BEFORE], before)
+            before = observation["achieved_goal"]
+            assert again(observation["achieved_goal"], observation["desired_goal"], info) == value
+            steps.append((observation["achieved_goal"], observation["desired_goal"], info, value))
+            if reward == "dense":
+                assert value <= 0 and (value == 0 or not info["is_success"])
+                assert value == 0 or not terminated
+                assert (value == 0) == all(env.unwrapped._fulfilled())
+        achieved, desired, infos, values = zip(*steps, strict=True)
+        batch = again(np.array(achieved), np.array(desired), np.array(infos))
+        assert batch.tolist() == list(values)
+        if reward == "sparse":  # the same as without the extras
+            assert values == tuple(step[1] for step in episode(plain, iter(played)))
+        if policy == "expert":
+            assert terminated and (sum(values) > 0 if reward == "sparse" else value == 0)
 
 
 def test_the_dense_reward_is_its_formula_and_rises_on_the_way(make: Make) -> None:
@@ -230,8 +230,7 @@ def test_compute_reward_says_what_it_needs(make: Make) -> None:
 # -- Other libraries -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("control", ["primitive", "ee"])
+@pytest.mark.parametrize(("control", "reward"), [("primitive", "dense"), ("ee", "sparse")])
 @pytest.mark.parametrize("env_id", IDS)
 def test_the_checkers_find_nothing(env_id: str, control: str, reward: str) -> None:
     env = tiny(env_id, control=control, reward=reward)
@@ -247,7 +246,7 @@ def test_the_checkers_find_nothing(env_id: str, control: str, reward: str) -> No
 )
 def test_stable_baselines_checker_finds_nothing(observations: Any) -> None:
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    for env_id, control, reward in product(IDS, ("primitive", "ee"), REWARDS):
+    for env_id, (control, reward) in product(IDS, [("primitive", "dense"), ("ee", "sparse")]):
         env = gym.make(env_id, observations=observations, control=control, reward=reward, image_size=64)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -362,24 +361,23 @@ def resident_kilobytes() -> int:
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's own figures")
 @pytest.mark.parametrize("env_id", [IDS[0], IDS[2]])
 def test_time_and_memory_of_resets_stay_flat(env_id: str) -> None:
-    """Over 300 resets and as many steps; 5,000 were measured by hand."""
-    env = tiny(env_id, control="ee", scene="varied" if env_id == IDS[0] else "simple", reward="dense")
-    if env_id == IDS[2]:
-        env.unwrapped._wishes = {"family": "swap"}  # families differ in time
+    """Over 90 resets and as many steps."""
+    wishes = {"family": "swap"} if env_id == IDS[2] else {"n_objects": 6}  # families differ in time
+    env = tiny(env_id, control="ee", reward="dense", **wishes)
     bullet = env.unwrapped.world.bullet
     seconds, memory = [], []
     for _ in range(6):
         began = time.process_time()
-        for seed in range(50):
+        for seed in range(15):
             _, info = env.reset(seed=seed)
             env.step(env.action_space.sample())
             assert bullet.getNumBodies() == 2 + len(info["objects"])
-            assert bullet.getNumConstraints() <= 1, "a block that hangs at the arm"
+            assert bullet.getNumConstraints() == 0
         seconds.append(time.process_time() - began)
         gc.collect()
         memory.append(resident_kilobytes())
     assert memory[-1] - memory[1] < 2000, memory
-    assert min(seconds[3:]) < 1.25 * min(seconds[:3]), seconds
+    assert min(seconds[3:]) < 1.5 * min(seconds[:3]), seconds
     env.close()
 
 
