@@ -31,14 +31,13 @@ NUMBERS = ("goal", "state")
 tiny = partial(gym.make, image_size=16, extras=NUMBERS)
 
 
-def episode(env: gym.Env[Any, Any], actions: Iterator[np.ndarray]) -> list[tuple[Any, ...]]:
-    """What the steps gave."""
-    steps = []
+def episode(env: gym.Env[Any, Any], actions: Iterator[np.ndarray]) -> Iterator[tuple[Any, ...]]:
+    """What each step gives, until the end."""
     for action in actions:
-        steps.append(env.step(action))
-        if steps[-1][2] or steps[-1][3]:
+        step = env.step(action)
+        yield step
+        if step[2] or step[3]:
             break
-    return steps
 
 
 def anything(env: gym.Env[Any, Any], count: int) -> Iterator[np.ndarray]:
