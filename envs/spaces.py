@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import string
+from collections.abc import Sequence
 from math import pi
 from typing import Any
 
@@ -10,10 +11,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from .checks import check_choice
 from .geometry import Box2
+from .goals import GOALS, STATE_SIZE, goal_sizes
 from .physics.motion import MAX_SPEED, MAX_TURN
+from .tasks import Task
 
-EXTRAS = ("depth", "segmentation", "proprio")  # observations beside `rgb` and `instruction`, on request
+EXTRAS = ("depth", "segmentation", "proprio", "state", "goal", *GOALS)  # observations on request
 
 CHARSET = string.ascii_lowercase + " "
 """Characters an instruction is made of. Gymnasium's default charset for ``Text`` lacks the space."""
@@ -52,16 +56,37 @@ def check_action(space: spaces.Box, action: Any) -> NDArray[np.float32]:
     )
 
 
-def observation_space(size: int, far: float, longest: int, extras: tuple[str, ...]) -> spaces.Dict:
-    """Images of ``size`` with depths up to ``far`` metres, and sentences of up to ``longest`` characters."""
-    parts: dict[str, spaces.Space[Any]] = {
-        "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
-        "instruction": spaces.Text(longest, min_length=1, charset=CHARSET),
+def read_observations(
+    observations: str | Sequence[str] | None, extras: str | Sequence[str], always: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The names of all observations; ValueError for one that there is not."""
+    extras = (extras,) if isinstance(extras, str) else extras
+    for extra in extras:
+        check_choice("extras", extra, EXTRAS)
+    if observations is not None:
+        names = (observations,) if isinstance(observations, str) else tuple(observations)
+        for name in names:
+            check_choice("observation", name, (*always, *EXTRAS))
+        if not names or extras:
+            raise ValueError(
+                "observations names all that there shall be, at least one, and goes without extras"
+            )
+        return tuple(dict.fromkeys(names))
+    goals = ("goal", *GOALS) if "goal" in extras else ()
+    return (*always, *(name for name in EXTRAS if name in (*extras, *goals)))
+
+
+def observation_space(size: int, far: float, task: Task, names: tuple[str, ...]) -> spaces.Dict:
+    """Of the observations with these names: images of ``size`` with depths up to ``far`` metres, and a task's goals."""
+    numbers = goal_sizes(task) | {"state": STATE_SIZE, "proprio": 11}
+    boxes: dict[str, spaces.Space[Any]] = {
+        name: spaces.Box(-10, 10, (length,), np.float32) for name, length in numbers.items()
     }
-    possible: dict[str, spaces.Space[Any]] = {
+    possible = boxes | {
+        "rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
+        "instruction": spaces.Text(task.longest_sentence, min_length=1, charset=CHARSET),
         "depth": spaces.Box(0, np.float32(far) * 1.001, (size, size), np.float32),
         "segmentation": spaces.Box(0, 255, (size, size), np.uint8),
         "goal_rgb": spaces.Box(0, 255, (size, size, 3), np.uint8),
-        "proprio": spaces.Box(-10, 10, (11,), np.float32),
     }
-    return spaces.Dict(parts | {name: space for name, space in possible.items() if name in extras})
+    return spaces.Dict({name: possible[name] for name in names})

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .checks import check_choice, check_range
 from .factors import Factors
+from .goals import BEFORE, GOALS, REWARDS, Reward, compute_reward, goal_vectors, state_vector
 from .options import OPTIONS, ResetOptions, Scenes, override, read_options, read_scenes, read_seed
 from .physics.arm import Joints
 from .physics.motion import Action, pick_and_place
@@ -22,7 +24,7 @@ from .physics.simulation import FIRST_OBJECT, Tabletop
 from .physics.supports import supports
 from .scene import Scene
 from .scenes import Setup, make_setup
-from .spaces import EXTRAS, check_action, ee_space, observation_space, primitive_space
+from .spaces import check_action, ee_space, observation_space, primitive_space, read_observations
 from .tasks import TASKS, Task
 
 Observation = dict[str, Any]
@@ -44,8 +46,11 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     ## Observation
     A dict: `rgb` (H, W, 3) uint8 and `instruction` (text). With ``extras``: `depth` (H, W) float32 in metres,
     `segmentation` (H, W) uint8 (0 table, 1 arm, 2 + i object i), `proprio` (11,) float32 (6 joint angles in
-    radians; tip x, y, z in metres; yaw in radians; 1 if something is held). `RearrangeBlocks-v0` also has
-    `goal_rgb` (H, W, 3) uint8, the goal picture; black where the instruction says the goal.
+    radians; tip x, y, z in metres; yaw in radians; 1 if something is held), and for policies that read no sentence and
+    see no picture `state` (133,) float32 (the gripper and all objects, see `envs.goals.state_vector`) and `goal`, which
+    brings `achieved_goal` and `desired_goal` with it (float32, see `envs.goals.goal_vectors`). `RearrangeBlocks-v0`
+    also has `goal_rgb` (H, W, 3) uint8, the goal picture; black where the instruction says the goal. With
+    ``observations``: these alone.
 
     ## Action
     ``control="primitive"``: `[pick_x, pick_y, place_x, place_y]` in metres of the world frame (with
@@ -55,24 +60,29 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     stops at contact.
 
     ## Reward and end
-    The reward is the change in the share of goal pairs that are fulfilled, with a goal picture of blocks that are
-    supported as it shows. The episode terminates when all are and the arm is back home (so both modes end alike,
-    and a next instruction may start); it truncates after ``max_steps``. In `RearrangeBlocks-v0` success itself
-    asks that the empty gripper is home and all objects rest.
+    ``reward="sparse"``: the change in the share of goal pairs that are fulfilled, with a goal picture of blocks that
+    are supported as it shows. ``reward="dense"``: what is left to do, 0 when all is done and never above: -1/P times
+    the sum over the unfulfilled of the P pairs of 1/2 + 1/4 min(1, d/0.5) + 1/4 min(1, t/0.5), with d metres from the
+    thing to its place in the plane and t from the tip to the thing. With `achieved_goal` and `desired_goal` among the
+    observations, ``compute_reward(achieved_goal, desired_goal, info)`` is the reward of a step, or of a batch.
+
+    The episode terminates when all pairs are fulfilled and the arm is back home (so both modes end alike, and a next
+    instruction may start); it truncates after ``max_steps``. In `RearrangeBlocks-v0` success itself asks that the empty
+    gripper is home and all objects rest.
 
     ## Info
-    Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`,
-    `target` (goal pairs as an array (P, 2): ids of the object that shall move and of that at which it shall
-    end), `objects` (dicts with id, label (its value in the segmentation), kind, color, position and
-    orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`, `table`), `camera`
-    (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the centre of the top-left
-    pixel is (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in
-    this scene, see `envs.factors.Factors`), `supports` (of each object what carries it: an id, -1 the table, -2
-    nothing, see `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` has no `target` but `goal` (tuples of a
-    relation and the two ids; none with a goal picture), `goal_supports` (of a goal picture, or None) and `family` (of
-    the scene, or None). With
-    ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of `reset`: see
-    `envs.physics.recorder.Recorder`. With ``scenes`` also `scene_number` in that list.
+    Fresh copies at each call: `is_success`, `cliport_success` (CLIPort's 5 cm criterion), `instruction`, `target`
+    (goal pairs as an array of the task's most pairs (P, 2): ids of the object that shall move and of that at which it
+    shall end, then rows of -1), `objects` (dicts with id, label (its value in the segmentation), kind, color,
+    position and orientation), `segmentation`, `palette` (RGB in 0..255: `colors` by name, `robot`, `table`), `camera`
+    (`intrinsics` (3, 3) and `extrinsics` (4, 4) world -> camera, OpenCV's frame; the centre of the top-left pixel is
+    (0.5, 0.5)), `gripper` (position, yaw, holding: an object id or -1), `factors` (their values in this scene, see
+    `envs.factors.Factors`), `supports` (of each object what carries it: an id, -1 the table, -2 nothing, see
+    `envs.physics.supports`), `sim_step`. `RearrangeBlocks-v0` has no `target` but `goal` (tuples of a relation and
+    the two ids; none with a goal picture), `goal_supports` (of a goal picture, or None) and `family` (of the scene,
+    or None). With ``record_frames=True`` also `frames`, `frame_segmentations` and `frame_states` of this step or of
+    `reset`: see `envs.physics.recorder.Recorder`. With ``scenes`` also `scene_number` in that list. With
+    `achieved_goal` also `achieved_before`, as it was before the step.
 
     Under `AsyncVectorEnv` with shared memory Gymnasium returns text observations as "aaaa..."; read
     ``info["instruction"]`` there, or pass ``shared_memory=False``.
@@ -111,7 +121,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         physics_hz: physics steps per second; by default 240 in "simple" and CLIPort's 480 in the others.
         max_steps: steps until truncation; by default 3 primitives (`RearrangeBlocks-v0`: 8) for each goal pair, or
             as many frames as they may take.
-        extras: further observations, one or several of "depth", "segmentation", "proprio".
+        extras: further observations, one or several of "depth", "segmentation", "proprio", "state", "goal",
+            "achieved_goal", "desired_goal".
         place_yaw: whether a primitive has a fifth value.
         record_frames: whether `info` holds all frames of a step.
         render_mode: "rgb_array" (`render` gives the newest frame), "rgb_array_list" (all frames since the last
@@ -120,6 +131,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         scenes: a list of scenes, or a JSON file with one, that resets walk through again and again: seeds, or
             mappings of reset options and `seed` (by default the scene's number). A reset with a seed goes to the
             scene of that number, modulo their count, and on from there.
+        reward: "sparse" or "dense".
+        observations: the names of those that there shall be, for libraries that know no text; by default `rgb`,
+            `instruction`, in `RearrangeBlocks-v0` `goal_rgb`, and the extras.
         **wishes: any other reset option, for every reset that does not say otherwise.
 
     Raises:
@@ -150,6 +164,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         factors: Factors | Mapping[str, Any] | None = None,
         render_size: int | None = None,
         scenes: Scenes | None = None,
+        reward: Reward = "sparse",
+        observations: str | Sequence[str] | None = None,
         **wishes: Any,
     ) -> None:
         if isinstance(task, str):
@@ -167,9 +183,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             )
         self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        extras = (extras,) if isinstance(extras, str) else extras
-        for extra in extras:
-            check_choice("extras", extra, EXTRAS)
+        check_choice("reward", reward, REWARDS)
+        always = ("rgb", "instruction", *("goal_rgb",) * self.task.stacks)
+        self.observations = read_observations(observations, extras, always)
         check_range("image_size", image_size, 16, 2048, whole=True)
         self.render_size = image_size if render_size is None else render_size
         check_range("render_size", self.render_size, 16, 2048, whole=True)
@@ -179,7 +195,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         if max_steps is not None:
             check_range("max_steps", max_steps, 1, 10**9, whole=True)
         self.control, self.render_mode, self.scene_name = control, render_mode, scene
-        self.extras, self.place_yaw, self.record_frames = tuple(extras), place_yaw, record_frames
+        self.reward, self.place_yaw, self.record_frames = reward, place_yaw, record_frames
         frames = 1 if control == "primitive" else EE_SECONDS * physics_hz / render_stride
         self.max_steps = max_steps or round(self.task.attempts * frames) * self.n_pairs
         self.metadata = self.metadata | {"render_fps": max(1, round(physics_hz / render_stride))}
@@ -188,10 +204,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         else:
             self._box = ee_space(render_stride / physics_hz)
         self.action_space = self._box  # type: ignore[assignment]  # Box knows no element type
-        longest = self.task.longest_sentence
-        self.observation_space = observation_space(
-            image_size, setup.camera.far, longest, (*self.extras, *("goal_rgb",) * self.task.stacks)
-        )
+        self.observation_space = observation_space(image_size, setup.camera.far, self.task, self.observations)
         self._wishes, self._scenes = wishes, None if scenes is None else read_scenes(scenes)
         self._scene_number, self._next_scene = -1, 0
         self._read(None)
@@ -253,6 +266,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         before = self._fulfilled()
+        self._remember()
         values = check_action(self._box, action)
         self._recorder.restart()
         self._actions.append(values)
@@ -267,10 +281,25 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._move(values)
         if not self._recorder.images:
             self._capture()
-        after = self._fulfilled()
-        reward = (sum(after) - sum(before)) / len(after)
+        if self.reward == "sparse":
+            after = self._fulfilled()
+            reward = (sum(after) - sum(before)) / len(after)
+        else:
+            goals = self._goals()
+            reward = float(compute_reward("dense", goals["achieved_goal"], goals["desired_goal"]))
         terminated = self.task.succeeded(self.world, self.robot, self.scene) and self.robot.is_home
         return self._observe(), reward, terminated, len(self._actions) >= self.max_steps, self._info()
+
+    @property
+    def compute_reward(self) -> Callable[[ArrayLike, ArrayLike, Any], NDArray[np.float64]]:
+        """See `envs.goals.compute_reward`, with this environment's reward.
+
+        Raises:
+            AttributeError: without goals among the observations; libraries take what has it for goal-conditioned.
+        """
+        if not set(GOALS) <= set(self.observations):
+            raise AttributeError('compute_reward needs achieved_goal and desired_goal: extras=("goal",)')
+        return partial(compute_reward, self.reward)
 
     def render(self) -> NDArray[np.uint8] | list[NDArray[np.uint8]] | None:  # type: ignore[override]
         """What ``render_mode`` says: a frame (H, W, 3), a list of those, or None; a window shows itself.
@@ -358,6 +387,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._film = []
         self._recorder.restart()
         self._capture()
+        self._remember()
 
     def _capture(self) -> None:
         """Take a frame of this moment."""
@@ -384,17 +414,27 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     def _fulfilled(self) -> list[bool]:
         return self.task.fulfilled(self.world, self.robot, self.scene)
 
+    def _goals(self) -> dict[str, NDArray[np.float32]]:
+        return goal_vectors(self.task, self.world, self.robot, self.scene)
+
+    def _remember(self) -> None:
+        """Keep the achieved goal from before a step, from which the sparse reward is a change."""
+        self._before = self._goals()["achieved_goal"] if "achieved_goal" in self.observations else None
+
     def _observe(self) -> Observation:
         image, state = self._recorder.images[-1], self._recorder.states[-1]
-        extras = {
+        seen = {
+            "rgb": image.rgb.copy(),
+            "instruction": self.scene.instruction,
+            "goal_rgb": self._goal_rgb.copy(),
             "depth": image.depth.copy(),
             "segmentation": image.segmentation.copy(),
             "proprio": np.concatenate([state["arm"], state["gripper"]]),
+            "state": state_vector(state["gripper"], state["object_position"], self.scene.objects),
         }
-        always = {"rgb": image.rgb.copy(), "instruction": self.scene.instruction}
-        if self.task.stacks:
-            always["goal_rgb"] = self._goal_rgb.copy()
-        return always | {name: extras[name] for name in EXTRAS if name in self.extras}
+        if {"goal", *GOALS} & set(self.observations):
+            seen |= self._goals()
+        return {name: seen[name] for name in self.observations}
 
     def _info(self) -> dict[str, Any]:
         world, robot, goal = self.world, self.robot, self.scene.goal
@@ -402,7 +442,10 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "is_success": self.task.succeeded(world, robot, self.scene),
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
-            "target": np.array([(pair.thing, pair.target) for pair in goal]),
+            # As many rows always, so that vectorised environments can join them.
+            "target": np.array(
+                [*[pair[1:] for pair in goal], *[(-1, -1)] * (self.task.pairs[1] - len(goal))]
+            ),
             "objects": [],
             "segmentation": self._recorder.images[-1].segmentation.copy(),
             "palette": world.setup.palette,
@@ -413,7 +456,6 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "factors": deepcopy(self._drawn),
         }
         if self.task.stacks:
-            # No arrays of as many rows as pairs, which vectorised environments could not join.
             picture = self.scene.picture
             del info["target"]
             info |= {
@@ -427,4 +469,6 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             info["objects"].append(named | {"position": position, "orientation": orientation})
         if self._scenes is not None:
             info["scene_number"] = self._scene_number
+        if self._before is not None:
+            info[BEFORE] = self._before.copy()
         return info | (self._recorder.info() if self.record_frames else {})

@@ -39,7 +39,7 @@ class EpisodeResult:
     """What came of an episode."""
 
     success: bool  # the simulator's verdict after the last action
-    gained: float  # sum of the rewards: by how much the share of the goal that holds rose
+    gained: float  # sum of the rewards; of sparse ones, by how much the share of the goal that holds rose
     believes_reached: bool  # the planner's own verdict after the last action
     attempts: tuple[Attempt, ...]  # empty if the scene could not be grounded
     error: str | None  # why the loop gave up

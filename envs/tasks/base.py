@@ -188,6 +188,25 @@ class Task:
         """Whether each part of the scene's goal is true now. The reward is the change in their share."""
         return [self.relation(pair).fulfilled(world, robot, pair) for pair in scene.goal]
 
+    def asked(self, scene: Scene) -> tuple[GoalPair, ...]:
+        """What `fulfilled` judges, in its order; a target of `TABLE` is the table."""
+        return scene.goal
+
+    def true_of(self, world: Tabletop, robot: Robot, scene: Scene, things: set[int]) -> list[GoalPair]:
+        """All that is true now of the things with these ids, asked for or not."""
+        kinds = [item.kind for item in scene.objects]
+        return [
+            pair
+            for relation in self.relations
+            for thing, target in permutations(range(len(kinds)), 2)
+            if thing in things and (kinds[thing], kinds[target]) == relation.kinds
+            if relation.fulfilled(world, robot, pair := GoalPair(relation.name, thing, target))
+        ]
+
+    def destination(self, world: Tabletop, scene: Scene, pair: GoalPair) -> tuple[float, float, float]:
+        """Where a pair that is `asked` wants its thing: (x, y) over the target, and the target's height; metres."""
+        return *self.relation(pair).place(world, pair), world.pose(pair.target)[0][2]
+
     def succeeded(self, world: Tabletop, robot: Robot, scene: Scene) -> bool:
         """Whether the whole goal is true now."""
         return all(self.fulfilled(world, robot, scene))

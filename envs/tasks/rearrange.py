@@ -18,7 +18,7 @@ from ..physics.robot import Robot
 from ..physics.simulation import Tabletop
 from ..physics.supports import SETTLED_SPEED, supports
 from ..sampling import SceneRequest, place_objects
-from ..scene import TABLE, GoalPair, ObjectSpec, Scene, Thing
+from ..scene import NOWHERE, TABLE, GoalPair, ObjectSpec, Scene, Thing
 from .base import Question, Relation, Task
 from .put_in_bowl import In
 
@@ -97,6 +97,23 @@ class Rearrange(Task):
 
     def fulfilled(self, world: Tabletop, robot: Robot, scene: Scene) -> list[bool]:
         return self.holds(supports(world, robot), scene)
+
+    def asked(self, scene: Scene) -> tuple[GoalPair, ...]:
+        if scene.picture is None:
+            return scene.goal
+        blocks = [index for index, item in enumerate(scene.picture) if item.kind == "block"]
+        return _as_pairs(scene, [scene.picture[index].support for index in blocks], blocks)
+
+    def true_of(self, world: Tabletop, robot: Robot, scene: Scene, things: set[int]) -> list[GoalPair]:
+        carried_by = supports(world, robot)
+        found = [index for index in sorted(things) if carried_by[index] != NOWHERE]
+        return [*_as_pairs(scene, [carried_by[index] for index in found], found)]
+
+    def destination(self, world: Tabletop, scene: Scene, pair: GoalPair) -> tuple[float, float, float]:
+        if pair.target != TABLE:
+            return super().destination(world, scene, pair)
+        assert scene.picture is not None  # only pictures ask for the table
+        return scene.picture[pair.thing].x, scene.picture[pair.thing].y, 0.0
 
     def succeeded(self, world: Tabletop, robot: Robot, scene: Scene) -> bool:
         """Whether all holds, every object rests, and the gripper is empty and back home."""
@@ -275,6 +292,13 @@ def arrangement_after(carried_by: Supports, sentence: GoalPair) -> Supports:
 def with_supports(objects: Sequence[ObjectSpec], carried_by: Supports) -> tuple[ObjectSpec, ...]:
     """The objects, carried as the supports say; their places stay."""
     return tuple(item.carried_by(carried_by[index], objects) for index, item in enumerate(objects))
+
+
+def _as_pairs(scene: Scene, carriers: Sequence[int], things: Sequence[int]) -> tuple[GoalPair, ...]:
+    """That each thing is in or on what carries it."""
+    kinds = [scene.objects[carrier].kind if carrier != TABLE else "table" for carrier in carriers]
+    names = ["in" if kind == "bowl" else "on" for kind in kinds]
+    return tuple(map(GoalPair, names, things, carriers))
 
 
 def _top(carried_by: Supports, index: int) -> int:
