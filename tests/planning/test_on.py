@@ -42,7 +42,7 @@ def test_masks_show_what_stands_on_what() -> None:
         }
         for thing, target in permutations(masks, 2):
             truth = bool(info["supports"][thing] == target)
-            shown = ON.holds(masks[thing], masks[target])
+            shown = ON.shown(masks[thing], masks[target])
             right, pairs, stacked = right + (shown == truth), pairs + 1, stacked + truth
     env.close()
     assert stacked > 20 and right / pairs > 0.98, (right, pairs, stacked)
