@@ -261,7 +261,7 @@ class Episode:
                 said.append(base.task.scene(base.scene.objects, (pair,)).instruction)
                 info = env.step(expert.primitive(pair))[4]
             return Played(self, info["instruction"], bool(info["is_success"]), None, tuple(said), ())
-        result = self.pursue(worker, env, observation, info)
+        result = self.pursue(worker, env, goal_of(observation, info))
         said = [attempt.instruction.text for attempt in result.attempts]
         seconds = tuple(attempt.plan.seconds for attempt in result.attempts)
         return Played(
@@ -274,17 +274,10 @@ class Episode:
             result.error,
         )
 
-    def pursue(
-        self,
-        worker: Worker,
-        env: gym.Env[Any, Any],
-        observation: Mapping[str, Any],
-        info: Mapping[str, Any],
-    ) -> EpisodeResult:
-        """Plan and act in an environment that was reset to the scene; see `run_episode`."""
+    def pursue(self, worker: Worker, env: gym.Env[Any, Any], goal: AnyGoal) -> EpisodeResult:
+        """Plan and act; see `run_episode`."""
         searcher = self.searcher
         assert searcher.plan is not None
-        goal = goal_of(observation, info)
         model = worker.world_model if self.load is None else worker.model(self.load)
         return run_episode(
             env,
@@ -372,7 +365,7 @@ class ConsequenceClip:
             films.append(to_uint8(obvious.frames[0]))
         else:
             films.append(goal.rgb[None])
-        result = episode.pursue(worker, env, observation, info)
+        result = episode.pursue(worker, env, goal)
         taken = [
             model.rollout(attempt.rgb, attempt.instruction.text, horizon=horizon)
             for attempt in result.attempts
@@ -401,9 +394,7 @@ def family_scene(family: str, number: int, look: str = "simple", side: int = CLO
     """A scene of a family, from the seeds of the test split, seen in pictures of so many pixels a side."""
     split = SPLITS["test"]
     options = (("color_split", "seen"), ("family", family), ("n_objects", 6))
-    return StudyScene(
-        "test", split.seed(number), options, look=look, image_size=side, env_id="RearrangeBlocks-v0"
-    )
+    return StudyScene("test", split.seed(number), options, 1, look, side, "RearrangeBlocks-v0")
 
 
 def ground_of(run: Run) -> tuple[str, int]:
@@ -416,20 +407,18 @@ def ground_of(run: Run) -> tuple[str, int]:
 
 def units(run: Run) -> dict[str, Part]:
     """Every episode, family by family, and the sentences that are foreseen."""
-    parts, seed = {}, run.args.seed
+    parts, seed, ground = {}, run.args.seed, ground_of(run)
     others = {key: LoadCheckpoint(name) for key, name in retrained(cast(Args, run.args).retrained).items()}
     for place, family in enumerate(FAMILIES):
         first = SCENES_PER_SEED * seed + FIRST + APART * place
-        scenes = [family_scene(family, first + i, *ground_of(run)) for i in range(run.sizes.scenes)]
+        scenes = [family_scene(family, first + i, *ground) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
         keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
         parts[family] = Part(
             [Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7
         )
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
-    scenes = [
-        family_scene(names[i % len(names)], first + i, *ground_of(run)) for i in range(run.sizes.outcomes)
-    ]
+    scenes = [family_scene(names[i % len(names)], first + i, *ground) for i in range(run.sizes.outcomes)]
     foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
     parts[OUTCOMES] = Part(foreseen, 0.6)
     return {**parts, "clips": Part(seconds=2.0, count=run.sizes.clips)}
