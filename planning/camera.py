@@ -95,9 +95,8 @@ class View:
         """How many pixels (...) a pixel of `CLOSE` is, where places (..., 2) in pixels show the table."""
         if self._is_close:
             return torch.ones_like(places_N2[..., 0])
-        return torch.as_tensor(_METRES / self.camera.metres_per_pixel_at(self._points(places_N2))).to(
-            places_N2
-        )
+        zoom = _METRES / self.camera.metres_per_pixel_at(self._points(places_N2))
+        return torch.as_tensor(zoom).to(places_N2)
 
     @property
     def zoom_at_middle(self) -> float:
@@ -116,10 +115,8 @@ class View:
 
     @cached_property
     def _is_close(self) -> bool:
-        pairs = (
-            (getattr(one, name) for one in (self.camera, CLOSE)) for name in ("intrinsics", "extrinsics")
-        )
-        return all(np.allclose(*pair, rtol=0, atol=1e-9) for pair in pairs)
+        same = np.allclose(self.camera.intrinsics, CLOSE.intrinsics, rtol=0, atol=1e-9)
+        return same and np.allclose(self.camera.extrinsics, CLOSE.extrinsics, rtol=0, atol=1e-9)
 
     def _points(self, places_N2: Tensor) -> Array:
         """The points (..., 3) that places show; what is imagined out of the picture counts as at its edge."""
@@ -132,9 +129,8 @@ def _step(camera: PinholeCamera, points: Array) -> Array:
     """Pixels (..., 2) from what is seen of blocks at points (..., 3) that carry others to these."""
     towards = (-camera.extrinsics[:3, :3].T @ camera.extrinsics[:3, 3] - points) * (1.0, 1.0, 0.0)
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-    return camera.project(points + np.array([0.0, 0.0, STEP_UP])) - camera.project(
-        points + STEP_BACK * towards
-    )
+    upper, lower = points + np.array([0.0, 0.0, STEP_UP]), points + STEP_BACK * towards
+    return camera.project(upper) - camera.project(lower)
 
 
 _MIDDLE = CLOSE.unproject_to_plane(CLOSE.intrinsics[:2, 2], MIDDLE_HEIGHT)
