@@ -377,7 +377,11 @@ class ConsequenceClip:
         said = "; ".join(text.removeprefix("put ") for text in self.played.said) or "nothing"
         return Clip(
             name=f"imagination-{self.rank}.gif",
-            gif=gif([[film[::2] if len(film) > 1 else film for film in films]], seconds_a_frame=0.2),
+            gif=gif(
+                [[film[::2] if len(film) > 1 else film for film in films]],
+                seconds_a_frame=0.2,
+                scale=2 if episode.scene.image_size == CLOSE_SIDE else 1,
+            ),
             panels=(
                 "the goal, said at once" if isinstance(goal, Goal) else "the goal",
                 "the plan",
