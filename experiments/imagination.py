@@ -3,26 +3,30 @@
     python experiments/imagination.py              # default: about 25 minutes on 2 cores
     python experiments/imagination.py --quick      # a first look
     python experiments/imagination.py --retrained runs/outcome-1/checkpoint --retrained runs/outcome-2/checkpoint
+    python experiments/imagination.py --scene cliport --checkpoint runs/cliport/checkpoint
 
 Goals in `RearrangeBlocks-v0`: blocks in bowls that are taken, blocks that carry another, blocks that are to change
 places, towers, and pictures of other arrangements. Ours searches sequences of sentences, and asks the world model where
 each leads. Beside it: the goal's own sentences without any imagination; the same search by a robot that believes every
 sentence; any sentence at random; and a search in the simulator itself. The simulator alone judges, strictly: what
 carries what, everything at rest, the gripper back home. `--retrained` measures checkpoints of other training seeds in
-the same scenes. Writes `results.json`, `timings.json`, `report.html`, plots and clips into `--out`.
+the same scenes. `--scene cliport` asks all this on CLIPort's table, seen by its camera; a model that foresees no
+outcome in one step then foresees by whole films. Writes `results.json`, `timings.json`, `report.html`, plots and clips
+into `--out`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Literal, cast
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -66,7 +70,7 @@ from planning import (
     seen_supports,
 )
 from planning.masks import centroids
-from textocvp import WorldModel
+from planning.search import HORIZON
 from textocvp.checkpoint import WEIGHTS_FILE
 from textocvp.protocols import LoadCheckpoint, LoadModel
 from textocvp.rollout import Rollout
@@ -83,6 +87,7 @@ CASES = ("plain", "occupied", "covered", "both")
 both."""
 BUDGETS = (15, 60, 250, 1000)
 TIMED, TIMES = 30, 15  # so many sentences, so often
+SIDE, CLOSE_SIDE = 336, 64  # pixels of a side of the pictures: of scenes `cliport`, and `simple`
 MakeSearch = Callable[[Foresees, int], Planner]
 
 
@@ -90,16 +95,42 @@ MakeSearch = Callable[[Foresees, int], Planner]
 class Args(StudyArgs):
     """Arguments of this study."""
 
+    scene: Literal["simple", "cliport"] = "simple"
+    """Of the environments. With `cliport` checkpoint and folder are by default `cliport` and imagination-cliport."""
     retrained: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Folder of a checkpoint of another training seed, to measure beside the first."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.scene == "cliport" and self.checkpoint == StudyArgs.checkpoint:
+            self.checkpoint = "cliport"
         for name in self.retrained:
             if not (Path(name) / WEIGHTS_FILE).is_file():
                 raise UsageError(
                     f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}"
                 )
+
+    def folder(self, study: str) -> Path:
+        """See `StudyArgs.folder`; each scene has its own."""
+        return super().folder(study if self.scene == "simple" else f"{study}-{self.scene}")
+
+
+class ByFilms:
+    """A model without a predictor of whole sentences: it foresees where one leads by its whole film."""
+
+    def __init__(self, model: Foresees) -> None:
+        self.parse, self.rollout, self.longest_horizon = model.parse, model.rollout, model.longest_horizon
+
+    def outcome(self, obs: Rollout, text: Sequence[str], *, seed: int = 0) -> Rollout:
+        """See `Foresees`."""
+        film = self.rollout(obs, text, horizon=self.longest_horizon or HORIZON, seed=seed)
+        return replace(film, slots=film.slots[:, [0, -1]])
+
+
+def foresight(model: object) -> Foresees:
+    """The model, or what makes it foresee."""
+    foresees = cast(Foresees, model)
+    return foresees if getattr(model, "foresees", True) else ByFilms(foresees)
 
 
 @dataclass
@@ -220,7 +251,7 @@ class Episode:
 
     def run(self, worker: Worker) -> Played:
         """Play it."""
-        env, searcher = worker.environment(self.scene), self.searcher
+        env, searcher = worker.environment(self.scene, record=False), self.searcher
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         if searcher.plan is None:
             said = []
@@ -230,7 +261,7 @@ class Episode:
                 said.append(base.task.scene(base.scene.objects, (pair,)).instruction)
                 info = env.step(expert.primitive(pair))[4]
             return Played(self, info["instruction"], bool(info["is_success"]), None, tuple(said), ())
-        result = self.pursue(worker, observation, info)
+        result = self.pursue(worker, env, goal_of(observation, info))
         said = [attempt.instruction.text for attempt in result.attempts]
         seconds = tuple(attempt.plan.seconds for attempt in result.attempts)
         return Played(
@@ -243,17 +274,14 @@ class Episode:
             result.error,
         )
 
-    def pursue(
-        self, worker: Worker, observation: Mapping[str, Any], info: Mapping[str, Any]
-    ) -> EpisodeResult:
+    def pursue(self, worker: Worker, env: gym.Env[Any, Any], goal: AnyGoal) -> EpisodeResult:
         """Plan and act; see `run_episode`."""
         searcher = self.searcher
         assert searcher.plan is not None
-        goal = goal_of(observation, info)
         model = worker.world_model if self.load is None else worker.model(self.load)
         return run_episode(
-            worker.environment(self.scene),
-            searcher.plan(cast(Foresees, model), self.scene.seed),
+            env,
+            searcher.plan(foresight(model), self.scene.seed),
             goal,
             ground=(SegmentationGrounder if searcher.privileged else AppearanceGrounder).from_info,
             controller=LiteralController,
@@ -289,10 +317,10 @@ class Foresight:
 
     def run(self, worker: Worker) -> Foreseen:
         """Play and compare: right is what ends with every block carried by what it was foreseen to be carried by."""
-        env = worker.environment(self.scene)
+        env = worker.environment(self.scene, record=False)
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         base, rng = cast(TabletopEnv, env.unwrapped), np.random.default_rng([self.seed, self.scene.seed])
-        model = cast(Foresees, worker.world_model if self.load is None else worker.model(self.load))
+        model = foresight(worker.world_model if self.load is None else worker.model(self.load))
         task = cast(Rearrange, base.task)
         right: dict[str, list[bool]] = {case: [] for case in CASES}
         for _ in range(SENTENCES):
@@ -302,7 +330,8 @@ class Foresight:
             before, grounder = info["supports"], SegmentationGrounder.from_info(info)
             parsed, grounding = observe(model, observation["rgb"], PictureGoal(observation["rgb"]), grounder)
             things = sorted(grounding.things)
-            foreseen = seen_supports(places(model.outcome(parsed, [text]), grounding, things), things)[0]
+            ends_1N2 = places(model.outcome(parsed, [text]), grounding, things)
+            foreseen = seen_supports(ends_1N2, things, grounding.view)[0]
             observation, *_, info = env.step(Expert(env).primitive(pair))
             named = [Thing(item["color"], item["kind"]) for item in info["objects"]]
             carriers = [None if at < 0 else named[at] for at in info["supports"]]
@@ -327,14 +356,16 @@ class ConsequenceClip:
         env = worker.environment(episode.scene)
         observation, info = env.reset(seed=episode.scene.seed, options=dict(episode.scene.options))
         goal, model = goal_of(observation, info), worker.world_model
-        horizon = min(24, model.longest_horizon or 24)
+        horizon = model.longest_horizon or HORIZON
+        if episode.scene.look == "simple":  # in others the arm takes longer
+            horizon = min(HORIZON, horizon)
         films = []
         if isinstance(goal, Goal):
             obvious = model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon)
             films.append(to_uint8(obvious.frames[0]))
         else:
             films.append(goal.rgb[None])
-        result = episode.pursue(worker, observation, info)
+        result = episode.pursue(worker, env, goal)
         taken = [
             model.rollout(attempt.rgb, attempt.instruction.text, horizon=horizon)
             for attempt in result.attempts
@@ -346,7 +377,11 @@ class ConsequenceClip:
         said = "; ".join(text.removeprefix("put ") for text in self.played.said) or "nothing"
         return Clip(
             name=f"imagination-{self.rank}.gif",
-            gif=gif([[film[::2] if len(film) > 1 else film for film in films]], seconds_a_frame=0.2),
+            gif=gif(
+                [[film[::2] if len(film) > 1 else film for film in films]],
+                seconds_a_frame=0.2,
+                scale=2 if episode.scene.image_size == CLOSE_SIDE else 1,
+            ),
             panels=(
                 "the goal, said at once" if isinstance(goal, Goal) else "the goal",
                 "the plan",
@@ -359,27 +394,35 @@ class ConsequenceClip:
         )
 
 
-def family_scene(family: str, number: int) -> StudyScene:
-    """A scene of a family, from the seeds of the test split."""
+def family_scene(family: str, number: int, look: str = "simple", side: int = CLOSE_SIDE) -> StudyScene:
+    """A scene of a family, from the seeds of the test split, seen in pictures of so many pixels a side."""
     split = SPLITS["test"]
     options = (("color_split", "seen"), ("family", family), ("n_objects", 6))
-    return StudyScene("test", split.seed(number), options, env_id="RearrangeBlocks-v0")
+    return StudyScene("test", split.seed(number), options, 1, look, side, "RearrangeBlocks-v0")
+
+
+def ground_of(run: Run) -> tuple[str, int]:
+    """What the scenes look like, and the pixels of a side of the pictures: such as the model takes."""
+    look, own = cast(Args, run.args).scene, run.world_model.image_size[0]
+    if look == "simple":
+        return look, CLOSE_SIDE
+    return look, SIDE if SIDE % own == 0 else own
 
 
 def units(run: Run) -> dict[str, Part]:
     """Every episode, family by family, and the sentences that are foreseen."""
-    parts, seed = {}, run.args.seed
+    parts, seed, ground = {}, run.args.seed, ground_of(run)
     others = {key: LoadCheckpoint(name) for key, name in retrained(cast(Args, run.args).retrained).items()}
     for place, family in enumerate(FAMILIES):
         first = SCENES_PER_SEED * seed + FIRST + APART * place
-        scenes = [family_scene(family, first + i) for i in range(run.sizes.scenes)]
+        scenes = [family_scene(family, first + i, *ground) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
         keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
         parts[family] = Part(
             [Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7
         )
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
-    scenes = [family_scene(names[i % len(names)], first + i) for i in range(run.sizes.outcomes)]
+    scenes = [family_scene(names[i % len(names)], first + i, *ground) for i in range(run.sizes.outcomes)]
     foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
     parts[OUTCOMES] = Part(foreseen, 0.6)
     return {**parts, "clips": Part(seconds=2.0, count=run.sizes.clips)}
@@ -429,14 +472,17 @@ def rows(run: Run, found: Found) -> list[Row]:
 def milliseconds(run: Run) -> list[float]:
     """How long it takes to foresee where sentences lead, and to read the places of all things off the ends.
 
-    UsageError if the model cannot do it.
+    UsageError if a model of the scene `simple` cannot do it.
     """
-    if not cast(WorldModel, run.world_model).foresees:
-        raise UsageError(
-            f"{run.args.checkpoint} cannot foresee outcomes in one step, which this study is about"
-        )
-    scene = family_scene("plain", FIRST)
-    env, model = scene.make(), cast(Foresees, run.world_model)
+    (look, side), model = ground_of(run), foresight(run.world_model)
+    if isinstance(model, ByFilms):
+        problem = f"{run.args.checkpoint} cannot foresee outcomes in one step"
+        if look == "simple":
+            raise UsageError(f"{problem}, which this study is about")
+        run.remarks.append(f"{problem}: it foresees by whole films.")
+    run.remarks.append(f"Scenes {look}, {side}x{side} pixels.")
+    scene = family_scene("plain", FIRST, look, side)
+    env = scene.make(record=False)
     observation, info = env.reset(seed=scene.seed, options=dict(scene.options))
     goal, grounder = goal_of(observation, info), AppearanceGrounder.from_info(info)
     parsed, grounding = observe(model, observation["rgb"], goal, grounder)
@@ -505,21 +551,23 @@ def seconds(found: Found) -> dict[str, dict[str, float]]:
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    figures = list(results.rows)
+    figures, (look, side) = list(results.rows), ground_of(run)
+    goals, ends = (replace(one, title=f"{one.title}, scenes {look}") for one in (GOALS, ENDS))
     return [
         Section(
             "Goals that need foresight",
+            f"Scenes {look}, {side}x{side} pixels. {' '.join(run.remarks[:-1])} "
             "In plain scenes the sentence names the answer. In the others it does not: a block put into a taken bowl "
             "comes to rest on the block in it, and who picks a block that carries another takes that one. Every "
             "line may act once more than the fewest sentences demand, looks again after each action, and acts "
             "alike: it picks where the named block is seen and lets go over where the target is seen.",
-            [GOALS.table(figures), plot_table("success.png", GOALS, figures, label="goal reached")],
+            [goals.table(figures), plot_table("success.png", goals, figures, label="goal reached")],
         ),
         Section(
             "What was foreseen",
             f"{SENTENCES} random sentences in a row in scenes of all families. Plain: nothing on the block, nothing at "
             "its target. Occupied: something is at the target. Covered: something is on the block.",
-            [ENDS.table(figures), DETAILS.table(figures)],
+            [ends.table(figures), DETAILS.table(figures)],
         ),
         *_over_seeds(run, figures),
         Section(

@@ -15,7 +15,7 @@ Scoring rollouts without a robot:
 Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """
 
-from .camera import PinholeCamera
+from .camera import PinholeCamera, View
 from .controller import Controller, LiteralController, PickAndPlace
 from .grounding import (
     AppearanceGrounder,
@@ -106,6 +106,7 @@ __all__ = [
     "Thing",
     "Thresholds",
     "Trace",
+    "View",
     "Wanted",
     "WeightedSum",
     "ground",

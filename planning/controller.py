@@ -86,7 +86,7 @@ class LiteralController:
         while thing.kind == on.kinds[1]:
             below_it = torch.as_tensor(slot_center(rollout, grounding.slots_of(thing), 0))
             off = {
-                other: float(on.distance_of_places(torch.as_tensor(center), below_it))
+                other: float(on.distance_of_places(torch.as_tensor(center), below_it, grounding.view))
                 for other in grounding.of_kind(on.kinds[0])
                 if other not in pile
                 for center in [slot_center(rollout, grounding.slots_of(other), 0)]
@@ -107,7 +107,8 @@ class LiteralController:
                 continue
             for other in grounding.of_kind(relation.kinds[1]):
                 below_it = slot_center(rollout, grounding.slots_of(other), 0)
-                off = relation.distance_of_places(torch.as_tensor(center), torch.as_tensor(below_it))
+                both = torch.as_tensor(center), torch.as_tensor(below_it)
+                off = relation.distance_of_places(*both, grounding.view)
                 if other != thing and off <= relation.within_px:
                     below = self._height(rollout, grounding, other, below_it)
                     return below + relation.place_height - RESTING_HEIGHTS[other.kind]

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import linear_sum_assignment
 
-from .camera import PinholeCamera
+from .camera import MIDDLE_HEIGHT, PinholeCamera, View
 from .language import Instruction, Thing
 from .masks import Bools, frame_masks
-from .relations import RELATIONS
+from .relations import CLOSE_VIEW, RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -31,15 +31,13 @@ Floats = NDArray[np.floating[Any]]
 LIGHT = (0.7, 1.05)
 # To get a name that is not its nearest, a slot may be at most this far from it (Euclidean, RGB 0..1).
 SECOND_CHOICE = 0.25
-# A slot must be present this much, and win this many pixels, to be looked at.
+# A slot must be present this much, and win this many pixels of a `View`, to be looked at.
 MIN_PRESENCE, MIN_PIXELS = 0.5, 6
-# Slots of one colour name belong to one object when their pixels are at most this far apart.
+# Slots of one colour name belong to one object when their pixels are at most this far apart, in pixels of a `View`.
 TOUCH_PX = 2
 # What looks wider than this, in metres, is a bowl. In the first and last frames of 200 val episodes blocks look
 # 0.054 to 0.076 wide and bowls 0.115 to 0.149 (`experiments/calibrate.py`).
 BOWL_WIDTH = 0.095
-# Height above the table, in metres, at which apparent sizes are measured.
-MIDDLE_HEIGHT = 0.03
 # Labels in a segmentation of what is no object.
 BACKGROUND, ROBOT = 0, 1
 
@@ -76,6 +74,7 @@ class Grounding:
     arm: tuple[int, ...]
     # Usually one slot; two where a lit and a shaded side were parsed apart.
     things: Mapping[Thing, tuple[int, ...]] = field(default_factory=dict)
+    view: View = field(default=CLOSE_VIEW, compare=False)  # how large things are seen
 
     def of_kind(self, kind: str) -> tuple[Thing, ...]:
         """The things of one kind, sorted."""
@@ -140,14 +139,15 @@ class SegmentationGrounder:
 
     segmentation: Integers
     objects: Sequence[Mapping[str, Any]]
+    view: View = CLOSE_VIEW
 
     @classmethod
     def from_info(cls, info: Mapping[str, Any]) -> SegmentationGrounder:
-        """From `segmentation` and `objects` of the environments' `info`."""
-        return cls(info["segmentation"], info["objects"])
+        """From `segmentation`, `objects` and `camera` of the environments' `info`."""
+        return cls(info["segmentation"], info["objects"], View(PinholeCamera.from_info(info["camera"])))
 
     def __call__(self, parsed: Rollout) -> Grounding:
-        return ground_by_segmentation(parsed, self.segmentation, self.objects)[0]
+        return replace(ground_by_segmentation(parsed, self.segmentation, self.objects)[0], view=self.view)
 
 
 def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette) -> list[Grounding]:
@@ -158,33 +158,34 @@ def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette) -> list[Gr
     """
     colors_BK3, presence_BK = (values[:, 0].cpu().numpy() for values in (rollout.colors, rollout.presence))
     scenes = zip(frame_masks(rollout, 0), colors_BK3, presence_BK >= MIN_PRESENCE, strict=True)
-    return [_ground_scene(*scene, camera, palette) for scene in scenes]
+    return [_ground_scene(*scene, View(camera), palette) for scene in scenes]
 
 
 def _ground_scene(
-    masks_KHW: Bools, colors_K3: Floats, present_K: Bools, camera: PinholeCamera, palette: Palette
+    masks_KHW: Bools, colors_K3: Floats, present_K: Bools, view: View, palette: Palette
 ) -> Grounding:
-    area_K = masks_KHW.sum((1, 2))
+    area_K, zoom = masks_KHW.sum((1, 2)), view.zoom_at_middle
     largest = int(area_K.argmax())
     names = list(palette.colors)
     looks = [*palette.colors.values(), palette.robot, palette.table]
     cost_KN = np.stack([color_distance(colors_K3, color) for color in looks], axis=1)
     nearest_K = cost_KN.argmin(1)
-    slots = [k for k in np.flatnonzero(present_K & (area_K >= MIN_PIXELS)).tolist() if k != largest]
+    slots = [k for k in np.flatnonzero(present_K & (area_K >= MIN_PIXELS * zoom**2)).tolist() if k != largest]
     background = (largest, *(k for k in slots if nearest_K[k] > len(names)))
     arm = tuple(k for k in slots if nearest_K[k] == len(names))
-    groups = _merge_touching([k for k in slots if nearest_K[k] < len(names)], nearest_K, masks_KHW)
+    named = [k for k in slots if nearest_K[k] < len(names)]
+    groups = _merge_touching(named, nearest_K, masks_KHW, max(1, round(TOUCH_PX * zoom)))
     if not groups:
-        return Grounding(background, arm)
+        return Grounding(background, arm, view=view)
     area_G = np.array([area_K[group].sum() for group in groups])
     cost_GN = np.array([np.average(cost_KN[g, : len(names)], axis=0, weights=area_K[g]) for g in groups])
     things = {}
     # Weighted by area, so that a stray fragment never takes a name away.
     for g, n in zip(*linear_sum_assignment(cost_GN * area_G[:, None]), strict=True):
         if n == cost_GN[g].argmin() or cost_GN[g, n] <= SECOND_CHOICE:
-            width = apparent_width(np.any(masks_KHW[groups[g]], axis=0), camera)
+            width = apparent_width(np.any(masks_KHW[groups[g]], axis=0), view.camera)
             things[Thing(names[n], "bowl" if width > BOWL_WIDTH else "block")] = tuple(groups[g])
-    return Grounding(background, arm, things)
+    return Grounding(background, arm, things, view)
 
 
 def color_distance(colors_N3: Floats, color: Sequence[float]) -> Floats:
@@ -202,10 +203,10 @@ def apparent_width(mask_HW: Bools, camera: PinholeCamera) -> float:
     return float(12**0.5 * x.std() * camera.metres_per_pixel(center, MIDDLE_HEIGHT))
 
 
-def _merge_touching(slots: Sequence[int], name_K: Integers, masks_KHW: Bools) -> list[list[int]]:
+def _merge_touching(slots: Sequence[int], name_K: Integers, masks_KHW: Bools, apart: int) -> list[list[int]]:
     groups: list[list[int]] = []
     for slot in slots:
-        near = binary_dilation(masks_KHW[slot], np.ones((3, 3)), iterations=TOUCH_PX)
+        near = binary_dilation(masks_KHW[slot], np.ones((3, 3)), iterations=apart)
         same = [g for g in groups if name_K[g[0]] == name_K[slot] and (near & masks_KHW[g].any(0)).any()]
         merged = sorted([slot, *(other for g in same for other in g)])
         groups = [g for g in groups if g not in same] + [merged]

@@ -12,28 +12,42 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .camera import View
 from .masks import UNSEEN, Bools, center_inside, centroids
+
+CLOSE_VIEW = View()
 
 
 @dataclass(frozen=True)
 class Relation:
-    """One way in which a thing can stand to its target."""
+    """One way in which a thing can stand to its target. Pixels are those of the `close` camera at 64x64, see `View`."""
 
     template: str  # what asks for it in a sentence; `{thing}` and `{target}` stand for "red block" and so on
     kinds: tuple[str, str]  # of the thing and of its target
-    offset_px: tuple[float, float]  # from the target's centroid to the thing's then, x right and y down
+    # From the target's centroid to the thing's then, x right and y down. In another view it grows and leans as a stack.
+    offset_px: tuple[float, float]
     within_px: float  # an imagined rollout fulfils it while `distance` is at most this
-    # Whether bool masks (H, W) of thing and target show it, in the frame that is seen.
-    holds: Callable[[Bools, Bools], bool]
     place_height: float  # metres above the table of the point that the thing's slot is centred on then
+    # Whether bool masks (H, W) of thing and target show it; by default when their `distance` is small enough.
+    holds: Callable[[Bools, Bools], bool] | None = None
 
-    def distance(self, thing_NHW: Tensor, target_NHW: Tensor) -> Tensor:
+    def shown(self, thing_HW: Bools, target_HW: Bools, view: View = CLOSE_VIEW) -> bool:
+        """Whether bool masks (H, W) of thing and target show it, in the frame that is seen."""
+        if self.holds is not None:
+            return self.holds(thing_HW, target_HW)
+        both = torch.as_tensor(thing_HW), torch.as_tensor(target_HW)
+        return bool(self.distance(*both, view) <= self.within_px)
+
+    def distance(self, thing_NHW: Tensor, target_NHW: Tensor, view: View = CLOSE_VIEW) -> Tensor:
         """How far bool masks (..., H, W) are from it: (...) in pixels; inf where a mask is empty."""
-        return self.distance_of_places(centroids(thing_NHW), centroids(target_NHW)).nan_to_num(nan=UNSEEN)
+        return self.distance_of_places(centroids(thing_NHW), centroids(target_NHW), view).nan_to_num(
+            nan=UNSEEN
+        )
 
-    def distance_of_places(self, thing_N2: Tensor, target_N2: Tensor) -> Tensor:
-        """The same of places (..., 2) in pixels."""
-        return (thing_N2 - target_N2 - thing_N2.new_tensor(self.offset_px)).norm(dim=-1)
+    def distance_of_places(self, thing_N2: Tensor, target_N2: Tensor, view: View = CLOSE_VIEW) -> Tensor:
+        """The same of places (..., 2) in pixels of the view."""
+        offset_N2 = view.raised(thing_N2.new_tensor(self.offset_px).expand_as(target_N2), target_N2)
+        return (thing_N2 - target_N2 - offset_N2).norm(dim=-1) / view.zoom(target_N2)
 
     @property
     def pattern(self) -> re.Pattern[str]:
@@ -70,12 +84,6 @@ STACK_PX = 6.9  # rows by which a block's pixels are higher in the picture than 
 # tower.
 ON_PX = 4.0
 
-
-def _on(thing_HW: Bools, target_HW: Bools) -> bool:
-    on = RELATIONS["on"]
-    return bool(on.distance(torch.as_tensor(thing_HW), torch.as_tensor(target_HW)) <= on.within_px)
-
-
 RELATIONS: dict[str, Relation] = {
     "in": Relation(
         template="the {thing} in the {target}",
@@ -93,7 +101,6 @@ RELATIONS: dict[str, Relation] = {
         kinds=("block", "block"),
         offset_px=(0.0, -STACK_PX),
         within_px=ON_PX,
-        holds=_on,
         place_height=0.087,
     ),
 }

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .camera import View
 from .grounding import Grounding
 from .language import Goal, Instruction
-from .masks import Bools, contact_distance, frame_masks
-from .relations import RELATIONS, THRESHOLDS, Thresholds
+from .masks import Bools, centroids, contact_distance, frame_masks
+from .relations import CLOSE_VIEW, RELATIONS, THRESHOLDS, Thresholds
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -28,7 +29,7 @@ def holds(masks_KHW: Bools, grounding: Grounding, instruction: Instruction) -> b
     thing_HW, target_HW = (
         np.any(masks_KHW[list(grounding.slots_of(one))], axis=0) for one in instruction.things
     )
-    return RELATIONS[instruction.relation].holds(thing_HW, target_HW)
+    return RELATIONS[instruction.relation].shown(thing_HW, target_HW, grounding.view)
 
 
 def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instruction, ...]:
@@ -43,7 +44,7 @@ def unmet(parsed: Rollout, grounding: Grounding, goal: Goal) -> tuple[Instructio
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Distances along B rollouts at t frames, in pixels; inf where one of the two is not seen."""
+    """Distances along B rollouts at t frames, in pixels of a `View`; inf where one of the two is not seen."""
 
     frames: tuple[int, ...]  # (t,), increasing indices in the rollout
     contact_Bt: Tensor  # between arm and thing: `contact_distance`
@@ -85,12 +86,14 @@ def measure(
     target_BtHW: Tensor,
     relations: Sequence[str],
     frames: Sequence[int] | None = None,
+    views: Sequence[View] = (),
 ) -> Trace:
     """The trace of B clips whose bool masks (B, t, H, W) of arm, thing and target are given.
 
     Args:
         relations: B keys of `RELATIONS`.
         frames: which frames of the rollout the t masks show; by default 0..t-1.
+        views: of the B clips; by default all are of the `close` camera at 64x64.
 
     Raises:
         ValueError: if the shapes differ or are not (B, t, H, W).
@@ -100,13 +103,15 @@ def measure(
             f"masks must share one shape (B, t, H, W), got arm {tuple(arm_BtHW.shape)}, "
             f"thing {tuple(thing_BtHW.shape)}, target {tuple(target_BtHW.shape)}"
         )
-    distance_Bt = torch.empty(arm_BtHW.shape[:2])
-    for name in set(relations):
-        rows = [row for row, other in enumerate(relations) if other == name]
-        distance_Bt[rows] = RELATIONS[name].distance(thing_BtHW[rows], target_BtHW[rows])
+    contact_Bt, distance_Bt = contact_distance(arm_BtHW, thing_BtHW), torch.empty(arm_BtHW.shape[:2])
+    kinds = list(zip(relations, views or [CLOSE_VIEW] * len(relations), strict=True))
+    for name, view in set(kinds):
+        rows = [row for row, other in enumerate(kinds) if other == (name, view)]
+        distance_Bt[rows] = RELATIONS[name].distance(thing_BtHW[rows], target_BtHW[rows], view)
+        contact_Bt[rows] /= view.zoom(centroids(thing_BtHW[rows]))
     return Trace(
         tuple(range(arm_BtHW.shape[1]) if frames is None else frames),
-        contact_distance(arm_BtHW, thing_BtHW),
+        contact_Bt,
         distance_Bt,
         torch.tensor([RELATIONS[name].within_px for name in relations]),
     )
@@ -156,6 +161,7 @@ def measure_rollout(
         union([grounding.slots_of(instruction.target) for grounding, instruction in both]),
         [instruction.relation for instruction in each_instruction],
         frames,
+        [grounding.view for grounding in each_grounding],
     )
 
 

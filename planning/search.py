@@ -17,17 +17,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .camera import View
 from .grounding import Grounder, Grounding, GroundingError
 from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
 from .planners import Candidate, Imagines, Plan, observe
-from .relations import RELATIONS
+from .relations import CLOSE_VIEW, RELATIONS
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
-# Two pictures show a thing at one place while it is at most this far apart in them, in pixels of 64.
+# Two pictures show a thing at one place while it is at most this far apart in them, in pixels of a `View`.
 SAME_PLACE_PX = 4.0
-# Imagined states in which nothing is farther apart than this, in pixels, are one state.
+# Imagined states in which nothing is farther apart than this, in pixels of a `View`, are one state.
 MERGED_PX = 2.0
 SHOWN = 100  # candidates that a plan keeps
 HORIZON = 24  # frames of a film, where the model sets no limit
@@ -48,16 +49,21 @@ class Wanted:
 
     thing_G: Tensor  # which of the things that are seen
     target_G: Tensor  # which other one, or -1 where the place is fixed
-    offset_G2: Tensor  # from that one, or from the origin, in pixels
-    within_G: Tensor  # pixels
+    offset_G2: Tensor  # from that one in pixels of the view, or from the origin in pixels of the picture
+    within_G: Tensor  # pixels of the view
+    view: View = CLOSE_VIEW
 
     def ratios(self, places_BN2: Tensor) -> Tensor:
         """How far things at these places (B, N, 2) are from where they shall be (B, G); up to 1 is near enough."""
-        from_BG2 = torch.where(self.target_G[:, None] >= 0, places_BN2[:, self.target_G], 0.0)
-        return (places_BN2[:, self.thing_G] - from_BG2 - self.offset_G2).norm(dim=-1) / self.within_G
+        target_BG2, relative_G1 = places_BN2[:, self.target_G], self.target_G[:, None] >= 0
+        from_BG2 = torch.where(relative_G1, target_BG2, 0.0)
+        raised_BG2 = self.view.raised(self.offset_G2.expand_as(target_BG2), target_BG2)
+        offset_BG2 = torch.where(relative_G1, raised_BG2, self.offset_G2)
+        limit_BG = self.within_G * self.view.zoom(torch.where(relative_G1, target_BG2, self.offset_G2))
+        return (places_BN2[:, self.thing_G] - from_BG2 - offset_BG2).norm(dim=-1) / limit_BG
 
     @classmethod
-    def of_relations(cls, goal: Goal, things: Sequence[Thing]) -> Wanted:
+    def of_relations(cls, goal: Goal, things: Sequence[Thing], view: View = CLOSE_VIEW) -> Wanted:
         """What the instructions of a goal ask; a GroundingError if a thing is not seen."""
         for thing in goal.things:
             if thing not in things:
@@ -68,6 +74,7 @@ class Wanted:
             torch.tensor([things.index(one.target) for one in goal.instructions]),
             torch.tensor([relation.offset_px for relation in relations]),
             torch.tensor([relation.within_px for relation in relations]),
+            view,
         )
 
     @classmethod
@@ -77,9 +84,9 @@ class Wanted:
             both = [", ".join(map(str, sorted(ones))) or "nothing" for ones in (shown.things, things)]
             raise GroundingError(f"the goal's picture shows {both[0]}; the scene shows {both[1]}")
         places_N2 = places(goal, shown, things)[0]
-        limit = SAME_PLACE_PX * goal.image_size[1] / 64
         count = len(things)
-        return cls(torch.arange(count), torch.full((count,), -1), places_N2, torch.full((count,), limit))
+        limit_N = torch.full((count,), SAME_PLACE_PX)
+        return cls(torch.arange(count), torch.full((count,), -1), places_N2, limit_N, shown.view)
 
 
 def places(rollout: Rollout, grounding: Grounding, things: Sequence[Thing], frame: int = -1) -> Tensor:
@@ -88,22 +95,26 @@ def places(rollout: Rollout, grounding: Grounding, things: Sequence[Thing], fram
     return torch.stack([positions_BK2[:, list(grounding.slots_of(one))].mean(1) for one in things], dim=1)
 
 
-def seen_supports(places_BN2: Tensor, things: Sequence[Thing]) -> list[dict[Thing, Thing | None]]:
+def seen_supports(
+    places_BN2: Tensor, things: Sequence[Thing], view: View = CLOSE_VIEW
+) -> list[dict[Thing, Thing | None]]:
     """What each block is seen to be in or on, in B pictures; None for the table.
 
     Args:
         places_BN2: from `places`, of the N things.
+        view: of the grounding.
     """
     seen: list[dict[Thing, Thing | None]] = []
-    for places_N2 in places_BN2:
+    pairs = places_BN2[:, :, None], places_BN2[:, None]
+    off = {one: one.distance_of_places(*pairs, view).tolist() for one in RELATIONS.values()}
+    for b in range(len(places_BN2)):
         carried: dict[Thing, Thing | None] = {}
         for n, thing in enumerate(things):
             near: list[tuple[float, Thing | None]] = [(1.0, None)]
             for m, other in enumerate(things):
-                for relation in RELATIONS.values():
+                for relation, off_BNN in off.items():
                     if n != m and (thing.kind, other.kind) == relation.kinds:
-                        off = relation.distance_of_places(places_N2[n], places_N2[m])
-                        near.append((float(off) / relation.within_px, other))
+                        near.append((off_BNN[b][n][m] / relation.within_px, other))
             if thing.kind == "block":
                 carried[thing] = min(near, key=lambda one: one[0])[1]
         seen.append(carried)
@@ -205,10 +216,11 @@ class SearchPlanner:
                 said, left = sentences[:left], left - len(sentences[:left])
                 ends = self._foresee(state.batch.last.select(state.row), said, grounding)
                 places_BN2 = places(ends, grounding, things)
-                ratios_BG = wanted.ratios(places_BN2).numpy()
+                ratios_BG, zoom_BN = wanted.ratios(places_BN2).numpy(), grounding.view.zoom(places_BN2)
                 for row, (one, ratios_G) in enumerate(zip(said, ratios_BG, strict=True)):
                     new = _State(ends, row, (*state.instructions, one), state, ratios_G)
-                    known_M = (known_MN2 - places_BN2[row]).norm(dim=-1).amax(1) < MERGED_PX
+                    apart_MN = (known_MN2 - places_BN2[row]).norm(dim=-1) / zoom_BN[row]
+                    known_M = apart_MN.amax(1) < MERGED_PX
                     if known_M.any() and new.unmet:  # of ways to the goal all are kept: some may be slips
                         continue
                     known_MN2 = torch.cat([known_MN2, places_BN2[row : row + 1]])
@@ -258,7 +270,7 @@ class SearchPlanner:
         if isinstance(goal, PictureGoal):
             shown, its = observe(self.world_model, goal.rgb, goal, grounder, self.seed)
             return parsed, grounding, Wanted.of_picture(shown, its, things)
-        return parsed, grounding, Wanted.of_relations(goal, things)
+        return parsed, grounding, Wanted.of_relations(goal, things, grounding.view)
 
     def _foresee(self, state: Rollout, said: Sequence[Instruction], grounding: Grounding) -> Rollout:
         """Where each of some sentences leads from a state (B = 1)."""
@@ -275,8 +287,8 @@ class BelievingPlanner(SearchPlanner):
         positions_BK2 = state.positions[:, -1].repeat(len(said), 1, 1)
         for positions_K2, one in zip(positions_BK2, said, strict=True):
             thing, target = (list(grounding.slots_of(its)) for its in one.things)
-            offset_2 = positions_K2.new_tensor(RELATIONS[one.relation].offset_px)
-            positions_K2[thing] = positions_K2[target].mean(0) + offset_2
+            place_2, offset_2 = positions_K2[target].mean(0), RELATIONS[one.relation].offset_px
+            positions_K2[thing] = place_2 + grounding.view.raised(place_2.new_tensor(offset_2), place_2)
         return state.moved(positions_BK2, [one.text for one in said])
 
 

@@ -73,7 +73,7 @@ def _obvious(world_model: WorldModel, rgb: np.ndarray, goal: Goal, grounding: Gr
     """The goal's own sentences, one after another: where they are imagined to lead, and what is wrong with that."""
     asked, things = goal.instructions, sorted(grounding.things)
     frame, end = imagined_ends(world_model, rgb, [asked])[asked]
-    carriers = seen_supports(places(end, grounding, things), things)[0]
+    carriers = seen_supports(places(end, grounding, things), things, grounding.view)[0]
     wrong = [
         f"the {one.thing} is imagined to end {_where(carriers[one.thing])}, not {one.relation} the {one.target}"
         for one in asked

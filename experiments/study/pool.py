@@ -35,11 +35,11 @@ class Worker:
         model: Model = self._models[load]
         return model
 
-    def environment(self, scene: StudyScene) -> gym.Env[Any, Any]:
+    def environment(self, scene: StudyScene, record: bool = True) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""
-        key = scene.env_id, scene.steps, scene.look, scene.image_size
+        key = scene.env_id, scene.steps, scene.look, scene.image_size, record
         if key not in self._environments:
-            self._environments[key] = scene.make()
+            self._environments[key] = scene.make(record)
         return self._environments[key]
 
 

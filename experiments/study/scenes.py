@@ -33,13 +33,13 @@ class StudyScene:
     image_size: int = 64
     env_id: str = ""  # by default the one for goals of so many steps
 
-    def make(self) -> gym.Env[Any, Any]:
-        """The environment it is played in, which records the frames of its motions."""
+    def make(self, record: bool = True) -> gym.Env[Any, Any]:
+        """The environment it is played in, which may record the frames of its motions. Large ones take long to draw."""
         options: dict[str, Any] = {"scene": self.look, "image_size": self.image_size}
         if self.steps > 1:
             options["n_pairs"] = self.steps
         name = self.env_id or ("PutBlockInBowl-v0" if self.steps == 1 else "PutBlocksInBowls-v0")
-        return gym.make(name, control="primitive", record_frames=True, **options)
+        return gym.make(name, control="primitive", record_frames=record, **options)
 
 
 def scene_line(scene: Any) -> str:

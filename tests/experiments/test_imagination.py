@@ -17,11 +17,13 @@ from experiments.imagination import (
     SEEDS,
     STUDY,
     Args,
+    ByFilms,
     Episode,
     Foresight,
     Sizes,
     TrueSlotsPlanner,
     family_scene,
+    foresight,
     goal_of,
 )
 from experiments.study.pool import Worker
@@ -106,3 +108,33 @@ def test_a_model_without_foresight_is_refused(tmp_path: Path) -> None:
         Args(retrained=(str(tmp_path),))
     with pytest.raises(UsageError, match="cannot foresee outcomes"):
         run(STUDY, Args(checkpoint="ocvp-seq-small", out=tmp_path, quick=True, workers=1))
+
+
+def test_cliports_table_has_a_folder_and_a_model_of_its_own() -> None:
+    simple, cliport, own = Args(), Args(scene="cliport"), Args(scene="cliport", checkpoint="runs/mine")
+    assert [one.checkpoint for one in (simple, cliport, own)] == ["tabletop-small", "cliport", "runs/mine"]
+    assert cliport.folder("imagination").name == "imagination-cliport" != simple.folder("imagination").name
+    assert "--scene cliport" in cliport.command("imagination")
+
+
+def test_episodes_on_cliports_table() -> None:
+    """A model that foresees no outcome foresees by films; rows that imagine nothing do what they do elsewhere."""
+    worker = Worker(WorldModel.from_pretrained("cliport"))
+    model = foresight(worker.world_model)
+    assert isinstance(model, ByFilms)
+    played = {}
+    for key, family in (
+        ("simulator", "occupied"), ("no imagination", "occupied"), ("no imagination", "plain"), ("random", "plain"),
+    ):  # fmt: skip
+        scene = family_scene(family, 5_000, "cliport", 168)
+        played[key, family] = Episode(key, scene, seed=0).run(worker)
+    assert played["simulator", "occupied"].success and played["no imagination", "plain"].success
+    assert not played["no imagination", "occupied"].success
+    assert all(1 <= len(one.said) <= ATTEMPTS[family] for (_, family), one in played.items())
+    env = worker.environment(scene, record=False)
+    observation, _ = env.reset(seed=scene.seed, options=dict(scene.options))
+    said = [played["no imagination", "plain"].said[0]] * 2
+    ends = model.outcome(model.parse(observation["rgb"][None]), said)
+    film = model.rollout(model.parse(observation["rgb"][None]), said[:1], horizon=model.longest_horizon)
+    np.testing.assert_allclose(ends.positions[1, 1], film.positions[0, -1], atol=1e-3)
+    assert ends.slots.shape[1] == 2

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from planning import Instruction, Palette, PinholeCamera
+from planning.camera import CLOSE
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import Rollout
 from textocvp.slots import SlotLayout
@@ -27,15 +28,7 @@ HOME = np.array([0.34, 0.0, 0.13])
 
 # `info["camera"]` of the preset "close" with 64 pixels, and `info["palette"]`: constants, because without PyBullet
 # there are no environments to ask. tests/planning/test_camera.py compares them with the real ones.
-CAMERA_INFO = {
-    "intrinsics": [[260.619085695187, 0.0, 32.5], [0.0, 260.619085695187, 31.5], [0.0, 0.0, 1.0]],
-    "extrinsics": [
-        [0.0, 1.0, 0.0, 0.0],
-        [0.8290375725550417, 0.0, -0.5591929034707468, -0.4062284105519705],
-        [-0.5591929034707468, 0.0, -0.8290375725550417, 2.274004522700666],
-        [0.0, 0.0, 0.0, 1.0],
-    ],
-}
+CAMERA_INFO = vars(CLOSE)
 PALETTE_INFO = {
     "colors": {
         "blue": (78, 121, 167),

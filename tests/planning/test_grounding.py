@@ -105,7 +105,7 @@ def test_the_segmentation_agrees_where_appearance_is_right(
     for item in objects:
         truth[winner == seen.slots_of(Thing(item["color"], item["kind"]))[0]] = item["label"]
     assert ground_by_segmentation(parsed, truth.numpy(), objects) == [seen]
-    info = {"segmentation": truth.numpy(), "objects": objects}
+    info = {"segmentation": truth.numpy(), "objects": objects, "camera": vars(camera)}
     assert SegmentationGrounder.from_info(info)(parsed) == seen
     with pytest.raises(ValueError, match="segmentation is"):
         ground_by_segmentation(parsed, truth.numpy()[:32], objects)

@@ -186,9 +186,10 @@ def test_a_fallen_block_spoils_a_picture(env: TabletopEnv) -> None:
 # -- Families ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("scene", ["simple", "cliport"])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_starts_and_goals_of_the_families(make: Make, family: str) -> None:
-    env = make("RearrangeBlocks-v0", image_size=16).unwrapped
+def test_starts_and_goals_of_the_families(make: Make, family: str, scene: str) -> None:
+    env = make("RearrangeBlocks-v0", image_size=16, scene=scene).unwrapped
     lengths = set()
     for seed in range(30):
         observation, info = env.reset(seed=seed, options={"family": family})
@@ -235,9 +236,10 @@ def test_a_seed_draws_a_family_and_is_a_scene(make: Make) -> None:
         assert again == seen[seed][:3] and np.array_equal(observation["rgb"], seen[seed][3])
 
 
+@pytest.mark.parametrize("scene", ["simple", "cliport"])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_expert_reaches_every_goal(make: Make, family: str) -> None:
-    env = make("RearrangeBlocks-v0", image_size=16)
+def test_the_expert_reaches_every_goal(make: Make, family: str, scene: str) -> None:
+    env = make("RearrangeBlocks-v0", image_size=16, scene=scene)
     for seed in (100, 101):
         env.reset(seed=seed, options={"family": family, "n_objects": 5 + seed % 3})
         for action in Expert(env).actions():
@@ -299,8 +301,9 @@ def test_questions_say_what_really_moves(env: TabletopEnv) -> None:
 # -- As a Gymnasium environment ------------------------------------------------------------------------------
 
 
-def test_the_environment_passes_the_check() -> None:
-    env = gym.make("RearrangeBlocks-v0", image_size=16)
+@pytest.mark.parametrize("scene", ["simple", "cliport"])
+def test_the_environment_passes_the_check(scene: str) -> None:
+    env = gym.make("RearrangeBlocks-v0", image_size=16, scene=scene)
     with pytest.warns(UserWarning):
         check_env(env.unwrapped, skip_render_check=True)
     env.close()
