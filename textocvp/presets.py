@@ -94,6 +94,21 @@ CLIPORT_DINO = ModelConfig(
     text=PUBLISHED_TEXT,
     predictor=PUBLISHED,
 )
+# The same with a pretrained encoder that is a Python package. Blocks are 10 to 20 pixels wide: stride 8, 42x42 places.
+CLIPORT_LITE0 = ModelConfig(
+    name="cliport-lite0",
+    parser=replace(
+        PUBLISHED_SAVI,
+        image_size=336,
+        num_slots=10,
+        encoder="efficientnet-lite0",
+        encoder_dim=40,
+        encoder_patch=8,
+    ),
+    renderer=FeatureConfig(hidden=256, patches=42, feature_dim=40, image_channels=64),
+    text=PUBLISHED_TEXT,
+    predictor=SMALL,
+)
 NON_OC_SMALL = ModelConfig(
     name="non-oc-small",
     parser=HolisticConfig(pool_cells=4),
@@ -124,6 +139,7 @@ _ALL = (
     SAVI_SMALL,
     SAVI_CATER,
     CLIPORT_DINO,
+    CLIPORT_LITE0,
     CLIPORT,
     OCVP_SEQ_SMALL,
     OCVP_SEQ,
@@ -139,6 +155,7 @@ DESCRIPTIONS = {
     "savi-small": "TextOCVP with published slots, small, for ablations of the parser",
     "savi-cater": "TextOCVP-SAVi at the paper's sizes (CATER)",
     "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
+    "cliport-lite0": "TextOCVP-DINO's pipeline on the features of EfficientNet-Lite0, which pip installs",
     "cliport": "TextOCVP for CLIPort's scene: a parser that has learned to see, and sharp frames of 336x336",
     "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
     "ocvp-seq": "OCVP-Seq, no text, at its published size",
