@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from textocvp.pretrained import WeightsError
 
+AT_ONCE = 64  # frames; all of 16 episodes at 336x336 would take tens of gigabytes
 E = TypeVar("E", bound="FrozenEncoder")
 
 
@@ -86,7 +87,8 @@ class FrozenEncoder(nn.Module):
         """
         for side in frames_N3HW.shape[-2:]:
             self.cells(side)
-        return self._encode(self.load()._backbone[0].to(frames_N3HW.device), frames_N3HW)
+        backbone = self.load()._backbone[0].to(frames_N3HW.device)
+        return torch.cat([self._encode(backbone, some_n3HW) for some_n3HW in frames_N3HW.split(AT_ONCE)])
 
     @abstractmethod
     def _read(self) -> tuple[nn.Module, str]:

@@ -85,11 +85,12 @@ class FeatureProjection(nn.Module):
         super().__init__()
         # A transformer's features know it already, those of convolutions do not.
         self.position = PositionCode(feature_dim) if place else nn.Identity()
+        hidden = max(feature_dim, out_dim)
         self.mlp = nn.Sequential(
             nn.LayerNorm(feature_dim),
-            nn.Linear(feature_dim, feature_dim),
+            nn.Linear(feature_dim, hidden),
             nn.ReLU(),
-            nn.Linear(feature_dim, out_dim),
+            nn.Linear(hidden, out_dim),
         )
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
