@@ -169,7 +169,9 @@ def test_what_is_missing_or_wrong_is_named(
     with pytest.raises(WeightsError, match=r"lite0\.pth is missing"):
         encoder().load()
     monkeypatch.setitem(sys.modules, "efficientnet_lite_pytorch", None)  # as where it is not installed
-    with pytest.raises(WeightsError, match=r"parser\.encoder=efficientnet-lite0 .*'textocvp\[efficientnet\]'"):
+    with pytest.raises(
+        WeightsError, match=r"parser\.encoder=efficientnet-lite0 .*'textocvp\[efficientnet\]'"
+    ):
         encoder().load()
     # A model can be built and counted without it all.
     assert sum(p.numel() for p in TextOCVP(replace(TINY, name="x")).parser.parameters()) > 0
