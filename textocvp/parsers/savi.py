@@ -79,7 +79,7 @@ class ConvEncoder(nn.Module):
 
 
 class FeatureProjection(nn.Module):
-    """Features of a frozen encoder (N, F, h, w) to those for the slots (N, D, h, w); `place` tells them where they are."""
+    """Features of a frozen encoder (N, F, h, w) to those for the slots (N, D, h, w); `place` adds where they are."""
 
     def __init__(self, feature_dim: int, out_dim: int, place: bool) -> None:
         super().__init__()
