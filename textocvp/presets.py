@@ -86,10 +86,11 @@ SAVI_CATER = ModelConfig(
     text=PUBLISHED_TEXT,
     predictor=PUBLISHED,
 )
+PUBLISHED_DINO = replace(PUBLISHED_SAVI, image_size=336, num_slots=10, encoder="dinov2")
 # CLIPort at 336x336: 24x24 patches.
 CLIPORT_DINO = ModelConfig(
     name="cliport-dino",
-    parser=replace(PUBLISHED_SAVI, image_size=336, num_slots=10, encoder="dinov2"),
+    parser=PUBLISHED_DINO,
     renderer=FeatureConfig(hidden=1024, patches=24),
     text=PUBLISHED_TEXT,
     predictor=PUBLISHED,
@@ -98,7 +99,7 @@ CLIPORT_DINO = ModelConfig(
 # cut into 42x42 places their true masks keep an IoU of .83, into 21x21 .50.
 CLIPORT_LITE0 = ModelConfig(
     name="cliport-lite0",
-    parser=replace(CLIPORT_DINO.parser, encoder="efficientnet-lite0", encoder_dim=40, encoder_patch=8),
+    parser=replace(PUBLISHED_DINO, encoder="efficientnet-lite0", encoder_dim=40, encoder_patch=8),
     renderer=FeatureConfig(patches=42, feature_dim=40, image_channels=64),
     text=SMALL_TEXT,
     predictor=replace(SMALL, window=56),
