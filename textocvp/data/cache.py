@@ -25,7 +25,7 @@ from textocvp.data.episodes import Episodes
 from textocvp.files import replacing
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
-from textocvp.parsers.dino import DinoEncoder
+from textocvp.parsers.frozen import FrozenEncoder
 
 PART = 16  # episodes a file: what is lost at most when computing is killed
 CHUNK = 1 << 20  # bytes that are read at once, or one frame where that is more
@@ -184,7 +184,7 @@ def cached_slots(
 
 
 def cached_features(
-    encoder: DinoEncoder,
+    encoder: FrozenEncoder,
     episodes: Episodes,
     folder: Path,
     process: int = 0,
@@ -207,4 +207,4 @@ def cached_features(
         ]
         return np.concatenate(found)
 
-    return FrameCache(folder, episodes, encoder.load().fingerprint).fill(compute, process, processes)
+    return FrameCache(folder, episodes, encoder.load().identity).fill(compute, process, processes)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from textocvp.parsers.dino import DinoEncoder
+from textocvp.parsers.frozen import FrozenEncoder
 from textocvp.slots import SlotLayout
 
 MOST_SLOTS = 1000  # more would fill the memory before anything is seen
@@ -75,7 +75,7 @@ class SceneParser(nn.Module):
     def __init__(self, config: ParserConfig) -> None:
         super().__init__()
         self.config, self.layout = config, config.layout
-        self.dino: DinoEncoder | None = None  # a frozen image encoder, which is no part of the checkpoint
+        self.frozen: FrozenEncoder | None = None  # a frozen image encoder, which is no part of the checkpoint
 
     @abstractmethod
     def forward(

@@ -17,7 +17,9 @@ from torch import Tensor, nn
 from textocvp.layers import PositionCode, init_relu_
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
-from textocvp.parsers.dino import DinoEncoder, cells_along
+from textocvp.parsers.dino import DinoEncoder
+from textocvp.parsers.efficientnet import LITE0, EfficientNetEncoder
+from textocvp.parsers.frozen import cells_along
 from textocvp.slots import SlotLayout
 
 
@@ -30,10 +32,10 @@ class SaviConfig(ParserConfig):
     # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, or
     # of the frozen encoder's features.
     initializer: Literal["gaussian", "cluster"] = "cluster"
-    encoder: Literal["conv", "dinov2"] = "conv"  # learned, or frozen
+    encoder: Literal["conv", "dinov2", "efficientnet-lite0"] = "conv"  # learned, or frozen
     encoder_channels: int = 32  # width of the convolutional encoder
     encoder_stride: int = 1  # of its first convolution
-    # Folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub.
+    # Folder or hub id of DINOv2, file of EfficientNet-Lite0; empty for facebook/dinov2-base, and the extra's package.
     encoder_weights: str = ""
     encoder_dim: int = 768  # width of its features
     encoder_patch: int = 14  # side of its patches in pixels
@@ -51,7 +53,7 @@ class SaviConfig(ParserConfig):
 
     @property
     def features(self) -> tuple[int, int] | None:
-        if self.encoder != "dinov2":
+        if self.encoder == "conv":
             return None
         return cells_along(self.image_size, self.encoder_patch), self.encoder_dim
 
@@ -77,19 +79,22 @@ class ConvEncoder(nn.Module):
 
 
 class FeatureProjection(nn.Module):
-    """Features of a frozen encoder (N, F, h, w), which know their places, to those for the slots (N, D, h, w)."""
+    """Features of a frozen encoder (N, F, h, w) to those for the slots (N, D, h, w); `place` adds where they are."""
 
-    def __init__(self, feature_dim: int, out_dim: int) -> None:
+    def __init__(self, feature_dim: int, out_dim: int, place: bool) -> None:
         super().__init__()
+        # A transformer's features know it already, those of convolutions do not.
+        self.position = PositionCode(feature_dim) if place else nn.Identity()
+        hidden = max(feature_dim, out_dim)
         self.mlp = nn.Sequential(
             nn.LayerNorm(feature_dim),
-            nn.Linear(feature_dim, feature_dim),
+            nn.Linear(feature_dim, hidden),
             nn.ReLU(),
-            nn.Linear(feature_dim, out_dim),
+            nn.Linear(hidden, out_dim),
         )
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
-        return self.mlp(features_NFhw.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        return self.mlp(self.position(features_NFhw).permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class GaussianInitializer(nn.Module):
@@ -202,21 +207,22 @@ class SaviParser(SceneParser):
     def __init__(self, config: SaviConfig) -> None:
         super().__init__(config)
         dim = config.layout.dim
-        if config.encoder == "dinov2":
-            self.dino = DinoEncoder(
+        if config.encoder != "conv":
+            lite = config.encoder == LITE0
+            self.frozen = (EfficientNetEncoder if lite else DinoEncoder)(
                 config.encoder_weights,
                 dim=config.encoder_dim,
                 patch=config.encoder_patch,
                 fingerprint=config.encoder_fingerprint,
             )
-            self.cells = self.dino.cells(config.image_size)
-            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(config.encoder_dim, dim)
+            self.cells = self.frozen.cells(config.image_size)
+            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(config.encoder_dim, dim, lite)
         else:
             self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
         if config.initializer == "gaussian":
             self.initializer: GaussianInitializer | ClusterSlots = GaussianInitializer(dim)
         else:
-            self.initializer = ClusterSlots(dim, FeatureClusters() if self.dino else ClusterInitializer())
+            self.initializer = ClusterSlots(dim, FeatureClusters() if self.frozen else ClusterInitializer())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
         sizes = (dim, config.transition_heads, config.transition_hidden)
@@ -240,13 +246,13 @@ class SaviParser(SceneParser):
         """
         B, T = frames_BT3HW.shape[:2]
         K = self.config.num_slots if num_slots is None else num_slots
-        if self.dino is None:
+        if self.frozen is None:
             if features_BTLF is not None:
                 raise ValueError("features are for a parser with a frozen encoder: parser.encoder is 'conv'")
             seen_BTCHW = frames_BT3HW
         else:
             if features_BTLF is None:
-                features_BTLF = self.dino(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
+                features_BTLF = self.frozen(frames_BT3HW.flatten(0, 1)).unflatten(0, (B, T))
             seen_BTCHW = features_BTLF.transpose(2, 3).unflatten(3, (self.cells, self.cells))
         features_NDhw = self.encoder(seen_BTCHW.flatten(0, 1))
         h, w = features_NDhw.shape[-2:]

@@ -1,8 +1,8 @@
 """From a grid of image features to a picture: the second half of the TextOCVP-DINO renderer, and of MAGE-DINO.
 
 `cnn` is the published decoder; `vqgan` is built from the blocks of the VQGAN decoder (Esser et al. 2021), with which
-the paper's reconstructions get sharper for about twice the parameters. Both double the grid four times, so that 24x24
-features become 384x384, and resize the result to the size of the frames.
+the paper's reconstructions get sharper for about twice the parameters. Both double the grid until it is as large as the
+frame, at most four times: as published, 24x24 features become 384x384. The result is resized to the size of the frames.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-DOUBLINGS = 4
+DOUBLINGS = 4  # at most
 
 
 class CnnDecoder(nn.Module):
-    """Features (N, F, h, w) to frames (N, 3, H, W), about -1..1: four times 3x3 convolution, ReLU and doubling.
+    """Features (N, F, h, w) to frames (N, 3, H, W), about -1..1: 3x3 convolution, ReLU and doubling, a few times.
 
     `channels` is the width of the first convolution, a multiple of 8; every later one is half as wide.
     """
 
-    def __init__(self, feature_dim: int, channels: int, image_size: int) -> None:
+    def __init__(self, feature_dim: int, channels: int, cells: int, image_size: int) -> None:
         super().__init__()
         self.image_size = image_size
-        widths = [feature_dim, *(channels >> i for i in range(DOUBLINGS))]
+        widths = [feature_dim, *(channels >> i for i in range(doublings(cells, image_size)))]
         blocks: list[nn.Module] = []
         for wide, narrow in pairwise(widths):
             blocks += [nn.Conv2d(wide, narrow, 3, padding=1), nn.ReLU(), nn.Upsample(scale_factor=2)]
@@ -42,7 +42,7 @@ class VqganDecoder(nn.Module):
     `channels` is the width of the first blocks, a multiple of 32; the first three doublings halve it.
     """
 
-    def __init__(self, feature_dim: int, channels: int, image_size: int) -> None:
+    def __init__(self, feature_dim: int, channels: int, cells: int, image_size: int) -> None:
         super().__init__()
         self.image_size = image_size
         blocks: list[nn.Module] = [
@@ -54,7 +54,7 @@ class VqganDecoder(nn.Module):
             NonLocalBlock(channels),
         ]
         width = channels
-        for i in range(DOUBLINGS):
+        for i in range(doublings(cells, image_size)):
             narrower = channels >> min(i + 1, 3)
             blocks += [nn.Upsample(scale_factor=2), nn.Conv2d(width, narrower, 3, padding=1)]
             blocks += [ResidualBlock(narrower), ResidualBlock(narrower)]
@@ -96,6 +96,11 @@ class NonLocalBlock(nn.Module):
         return x_NCHW + self.out(mixed_NCHW)
 
 
+def doublings(cells: int, image_size: int) -> int:
+    """How often a grid of so many cells along a side is doubled."""
+    return next((n for n in range(DOUBLINGS) if cells << n >= image_size), DOUBLINGS)
+
+
 def _norm(channels: int) -> nn.GroupNorm:
     return nn.GroupNorm(min(32, channels), channels, eps=1e-6)
 
@@ -113,10 +118,10 @@ def check_channels(channels: int) -> None:
 
 
 def build_image_decoder(
-    kind: Literal["cnn", "vqgan"], feature_dim: int, channels: int, image_size: int
+    kind: Literal["cnn", "vqgan"], feature_dim: int, channels: int, cells: int, image_size: int
 ) -> CnnDecoder | VqganDecoder:
     """The decoder that `kind` names; errors as `check_channels`."""
     check_channels(channels)
     if kind == "cnn":
-        return CnnDecoder(feature_dim, channels, image_size)
-    return VqganDecoder(feature_dim, channels // 2, image_size)
+        return CnnDecoder(feature_dim, channels, cells, image_size)
+    return VqganDecoder(feature_dim, channels // 2, cells, image_size)

@@ -177,7 +177,7 @@ class FeatureRenderer(GridRenderer):
         # The alpha comes first, so that masks can be had without the features.
         super().__init__(config, layout, image_size, 1 + config.feature_dim)
         self.image_decoder = build_image_decoder(
-            config.image_decoder, config.feature_dim, config.image_channels, image_size
+            config.image_decoder, config.feature_dim, config.image_channels, config.patches, image_size
         )
 
     def forward(self, slots_BKD: Tensor) -> Rendered:

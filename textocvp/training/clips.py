@@ -17,7 +17,7 @@ from textocvp.data.episodes import Episodes
 from textocvp.data.prefetch import prefetch
 from textocvp.files import replacing
 from textocvp.parsers.base import to_frames
-from textocvp.parsers.dino import DinoEncoder
+from textocvp.parsers.frozen import FrozenEncoder
 from textocvp.training.light import relight
 from textocvp.training.run import Run, SettingsError, TrainingSettings, step_rng
 from textocvp.training.teacher import Teacher
@@ -113,7 +113,7 @@ def clip_reader(
     run: Run,
     args: ClipTraining,
     episodes: Episodes,
-    encoder: DinoEncoder | None,
+    encoder: FrozenEncoder | None,
     teacher: Teacher | None = None,
 ) -> ClipReader:
     """A reader of this process's clips; with `args.cache_features` the features of all episodes are computed first.
@@ -133,7 +133,7 @@ def clip_reader(
     if args.cache_features:
         if encoder is None:
             raise SettingsError(
-                "cache_features needs a frozen image encoder: set parser.encoder or vqvae.encoder to dinov2"
+                "cache_features needs a frozen image encoder: set parser.encoder (or vqvae.encoder) to dinov2"
             )
         share = (run.accelerator.process_index, run.accelerator.num_processes)
         features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)

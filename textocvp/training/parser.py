@@ -158,7 +158,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
             raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes")
         learns = model.parser.taught and args.taught is None
         teacher = Teacher(args.teacher, episodes) if learns else None
-        reader = clip_reader(run, args, episodes, model.parser.dino, teacher)
+        reader = clip_reader(run, args, episodes, model.parser.frozen, teacher)
         for step, clips in reader.steps(run, "parser"):
             frames_BT3HW, features_BTLF = clips.on(run.device)
             lesson = clips.lesson(run.device)

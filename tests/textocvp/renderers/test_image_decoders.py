@@ -11,7 +11,7 @@ from textocvp.renderers.image_decoders import NonLocalBlock, build_image_decoder
 @pytest.mark.parametrize(("kind", "parameters"), [("cnn", 13_276_419), ("vqgan", 24_645_443)])
 def test_sizes_are_about_the_papers(kind: str, parameters: int) -> None:
     with torch.device("meta"):
-        decoder = build_image_decoder(kind, 768, 1024, 336)  # type: ignore[arg-type]
+        decoder = build_image_decoder(kind, 768, 1024, 24, 336)  # type: ignore[arg-type]
         frames = decoder(torch.empty(1, 768, 24, 24))
     assert sum(p.numel() for p in decoder.parameters()) == parameters
     assert frames.shape == (1, 3, 336, 336)
@@ -20,7 +20,7 @@ def test_sizes_are_about_the_papers(kind: str, parameters: int) -> None:
 @pytest.mark.parametrize("kind", ["cnn", "vqgan"])
 def test_a_feature_is_drawn_where_it_is(kind: str) -> None:
     torch.manual_seed(0)
-    decoder = build_image_decoder(kind, 5, 32, 56)  # type: ignore[arg-type]
+    decoder = build_image_decoder(kind, 5, 32, 4, 56)  # type: ignore[arg-type]
     features = torch.randn(2, 5, 4, 4)
     frames = decoder(features)
     assert frames.shape == (2, 3, 56, 56)  # 64 pixels, resized
@@ -57,4 +57,4 @@ def test_the_non_local_block_lets_every_location_see_all_others() -> None:
 
 def test_what_makes_no_sense_is_refused() -> None:
     with pytest.raises(ValueError, match=r"image_channels must be a multiple of 32, not 48"):
-        build_image_decoder("cnn", 8, 48, 16)
+        build_image_decoder("cnn", 8, 48, 4, 16)

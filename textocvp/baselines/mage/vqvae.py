@@ -192,7 +192,8 @@ class VQVAE(nn.Module):
             self.encoder, self.decoder = _convolutions(config)
         else:
             self.encoder = DinoCodes(config)
-            self.decoder = build_image_decoder("cnn", config.code_dim, config.channels, config.image_size)
+            sizes = (config.channels, self.encoder.cells, config.image_size)
+            self.decoder = build_image_decoder("cnn", config.code_dim, *sizes)
         self.codebook = Codebook(config.codebook_size, config.code_dim)
 
     @property
