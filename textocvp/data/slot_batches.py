@@ -51,6 +51,7 @@ class SlotBatches:
         recolor: permute the colour channels, where slots have explicit colour and the words of `text` have RGB.
         color_jitter: standard deviation of a shift of each slot's and each word's colour, in -1..1.
         place_jitter: standard deviation of the noise of `noisy`, in -1..1.
+        device: where batches are made; the episodes themselves stay in the main memory.
     """
 
     def __init__(
@@ -64,9 +65,10 @@ class SlotBatches:
         recolor: bool = True,
         color_jitter: float = 0.03,
         place_jitter: float = 0.01,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.layout, self.recolor = layout, recolor and layout.explicit and text.words_have_rgb
-        self.color_jitter, self.place_jitter = color_jitter, place_jitter
+        self.color_jitter, self.place_jitter, self.device = color_jitter, place_jitter, device
         self._slots_ETKD = padded(cache, frames, every)
         self._words = text.lookup(cache.instructions).to("cpu")
 
@@ -91,8 +93,9 @@ class SlotBatches:
         """Episodes picked at random, recoloured."""
         episodes_B = rng.integers(len(self), size=size)
         index = torch.from_numpy(episodes_B)
-        slots_BTKD, words = self._slots_ETKD[index].float(), self._words.select(index)
-        channels_B3 = torch.arange(3).expand(size, 3)
+        slots_BTKD = self._slots_ETKD[index].to(self.device).float()
+        words = self._words.select(index).to(self.device)
+        channels_B3 = torch.arange(3, device=self.device).expand(size, 3)
         if not self.layout.explicit:
             return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
         # The used slots of every episode first, cut to the most that any episode of the batch has.
@@ -102,15 +105,16 @@ class SlotBatches:
         slots_BTKD = slots_BTKD.take_along_dim(order_BK[:, None, :, None], dim=2)
         state = SlotState.split(slots_BTKD, self.layout)
         if self.recolor:
-            channels_B3 = torch.from_numpy(rng.permuted(np.tile(np.arange(3), (size, 1)), axis=1))
+            order_B3 = rng.permuted(np.tile(np.arange(3), (size, 1)), axis=1)
+            channels_B3 = torch.from_numpy(order_B3).to(self.device)
             words = words.permute_channels(channels_B3)
         # Colour and presence are carried through a rollout: what they are in the first frame they are in all.
         color = state.color[:, :1].take_along_dim(channels_B3[:, None, None], dim=-1)
         rng.random((2, size, 3))  # unused; without it a seed would give other runs than it always did
-        color = (color + _noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
+        color = (color + self._noise(rng, color.shape, self.color_jitter)).expand_as(state.color)
         presence = state.presence[:, :1].expand_as(state.presence)
         slots_BTKD = replace(state, color=color, presence=presence).join()
-        colors_BL3 = words.colors_BL3 + _noise(rng, words.colors_BL3.shape, self.color_jitter)
+        colors_BL3 = words.colors_BL3 + self._noise(rng, words.colors_BL3.shape, self.color_jitter)
         words = replace(words, colors_BL3=colors_BL3 * words.names_color_BL[..., None])
         return SlotBatch(slots_BTKD, words, episodes_B, channels_B3)
 
@@ -120,12 +124,13 @@ class SlotBatches:
         if not self.layout.explicit or self.place_jitter == 0:
             return slots_BTKD
         state = SlotState.split(slots_BTKD, self.layout)
-        noise = _noise(rng, state.position.shape, self.place_jitter).to(slots_BTKD.device)
+        noise = self._noise(rng, state.position.shape, self.place_jitter)
         return replace(state, position=state.position + noise * state.is_thing).join()
 
-
-def _noise(rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Tensor:
-    return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)) * deviation
+    def _noise(self, rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Tensor:
+        return (
+            torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)).to(self.device) * deviation
+        )
 
 
 def padded(slots: FrameCache, frames: int, every: int = 1) -> Tensor:
@@ -140,4 +145,4 @@ def true_frames(
     clips = [episodes.frames(index) for index in episodes_B]
     chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]
     frames_BS3HW = to_frames(np.stack(chosen))
-    return frames_BS3HW.take_along_dim(channels_B3[:, None, :, None, None], dim=2)
+    return frames_BS3HW.take_along_dim(channels_B3.cpu()[:, None, :, None, None], dim=2)

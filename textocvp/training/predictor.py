@@ -179,7 +179,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
                 UserWarning,
                 stacklevel=2,
             )
-        batches = SlotBatches(slots, layout, model.text, frames, every)
+        batches = SlotBatches(slots, layout, model.text, frames, every, device=accelerator.device)
         std_C = predictor.content_std_C if predictor.standardized else None
         if (
             std_C is not None and not args.finetune

@@ -57,6 +57,17 @@ def test_a_seed_gives_the_batches_that_it_always_gave() -> None:
     assert rng.random() == 0.34606143911247844
 
 
+def test_a_batch_is_made_on_its_own_device_whatever_the_default_is() -> None:
+    """On a GPU a tensor that was made without a device would be on the other one."""
+    source = batches(color_jitter=0.1, place_jitter=0.1)
+    plain = source.draw(np.random.default_rng(5), 4)
+    moved = source.noisy(np.random.default_rng(6), plain.slots_BTKD)
+    with torch.device("meta"):
+        drawn = source.draw(np.random.default_rng(5), 4)
+        assert torch.equal(source.noisy(np.random.default_rng(6), drawn.slots_BTKD), moved)
+    assert torch.equal(drawn.slots_BTKD, plain.slots_BTKD)
+
+
 def test_unused_slots_are_left_out_and_colors_stay_those_of_the_first_frame():
     drawn = batches(color_jitter=0.1).draw(np.random.default_rng(0), 4)
     state = SlotState.split(drawn.slots_BTKD, LAYOUT)

@@ -146,6 +146,17 @@ def test_clips_parsed_together_are_parsed_as_alone() -> None:
             torch.testing.assert_close(together[index, :2], alone, atol=1e-4, rtol=1e-4)
 
 
+def test_slots_are_made_where_the_frames_are_whatever_the_default_device_is() -> None:
+    """On a GPU a tensor that was made without a device would be on the other one."""
+    torch.manual_seed(1)
+    clips = torch.rand(2, 3, 3, 32, 32) * 2 - 1
+    parser = build(VOTES).parser
+    with torch.no_grad():
+        found = parser(clips).slots_BTKD
+        with torch.device("meta"):
+            assert torch.equal(parser(clips).slots_BTKD, found)
+
+
 def test_the_lesson_is_over_when_nothing_is_wrong() -> None:
     labels = scene((2, 8, 8, 5, 5), (3, 8, 13, 5, 5), (1, 0, 20, 9, 3))
     logits, votes = perfect(labels)

@@ -182,7 +182,8 @@ def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained() -
 def test_imagined_frames_are_the_rollout_and_each_predicts_the_next() -> None:
     model = build(replace(PLACED, parser=replace(PLACED.parser, layout=LAYOUT)))
     slots_BTKD, words = true_slots(6)[:3], model.text.lookup(["put the red block in the blue bowl"] * 3)
-    predicted, _ = PredictorStage(model)(slots_BTKD[:, :2], words, 3)
+    with torch.device("meta"):  # a default that fails wherever a tensor is made without a device, as on a GPU
+        predicted, _ = PredictorStage(model)(slots_BTKD[:, :2], words, 3)
     with torch.no_grad():
         imagined = model.predictor.rollout(slots_BTKD[:, :2], model.text.encode(words), 4).slots_BSKD
     assert predicted.shape[1] == 5  # of frames 1 to 5
