@@ -319,7 +319,9 @@ def _ends(infos: list[dict[str, Any]]) -> NDArray[np.int64]:
     return np.cumsum([len(each["frames"]) for each in infos]) - 1
 
 
-def _primitives(infos: list[dict[str, Any]], actions: list[NDArray[np.float32]]) -> tuple[dict[str, Any], ...]:
+def _primitives(
+    infos: list[dict[str, Any]], actions: list[NDArray[np.float32]]
+) -> tuple[dict[str, Any], ...]:
     """The primitives of an episode, each with the number of the frame before it moves."""
     pairs = zip(_ends(infos)[:-1].tolist(), actions, strict=True)
     return tuple({"frame": frame, "action": action.tolist()} for frame, action in pairs)

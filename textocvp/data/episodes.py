@@ -78,13 +78,13 @@ class Episode(Truth):
     reset_options: dict[str, Any] | None = None
     """What the simulator's `reset` was given beside the seed, if it is known."""
     action: NDArray[np.float32] | None = None
-    """(T, A) what was done from each frame on; the last leads to no frame. In collected files A = 5: the tool's motion."""
+    """(T, A) what was done from each frame on; the last leads to no frame. Collected files: the tool's motion, A = 5."""
     reward: NDArray[np.float32] | None = None
     """(T,) for what was done from each frame on."""
     state: NDArray[np.float32] | None = None
     """(T, S) of the robot; in collected files S = 11: `arm` and `gripper`."""
     primitives: tuple[dict[str, Any], ...] = ()
-    """Whole pick-and-places: the `frame` from which on, and the `action` `[pick_x, pick_y, place_x, place_y]`, metres."""
+    """Whole pick-and-places: the `frame` from which on, and the `action` [pick_x, pick_y, place_x, place_y], metres."""
 
 
 class Episodes(ABC):

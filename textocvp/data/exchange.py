@@ -34,7 +34,10 @@ CAMERA = "observation.images.rgb"
 OURS = "textocvp/"  # columns of LeRobot's table of episodes that only this program reads
 FILE_BYTES = 100 << 20  # of a data file, as LeRobot's own
 MINARI_NAME = re.compile(r"[-\w.]+-v\d+")
-_INDEX = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
+_INDEX = {
+    "timestamp": "float32",
+    **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64"),
+}
 
 
 def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
@@ -54,7 +57,9 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             columns |= {name: v for name in ("seed", "success") if (v := getattr(episode, name)) is not None}
             lists = {"primitives": episode.primitives} if episode.action is not None else {}
             lists |= {name: v for name in ("objects", "questions") if (v := getattr(episode, name))}
-            columns |= {n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()}
+            columns |= {
+                n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()
+            }
             if number == 0:
                 robot, rows = episode.robot, {name: [] for name in columns}
                 for name, values in arrays.items():
@@ -64,7 +69,9 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
                         chunks=(4 if image else 256, *shape), compression="gzip" if image else None,
                     )  # fmt: skip
             if lacking := {*rows, *(n for n in names if n in file)} - {*columns, *arrays}:
-                raise OwnVideosError(f"episode {number} has no {min(lacking)}, and the first has: all must be alike")
+                raise OwnVideosError(
+                    f"episode {number} has no {min(lacking)}, and the first has: all must be alike"
+                )
             for name in file:
                 if arrays[name].shape[1:] != file[name].shape[1:]:
                     raise OwnVideosError(
@@ -110,7 +117,13 @@ def kind_of(source: Path) -> str:
 
 
 def import_set(
-    source: Path, out: Path, *, size: int | None = None, crop: bool = False, every: int = 1, camera: str | None = None
+    source: Path,
+    out: Path,
+    *,
+    size: int | None = None,
+    crop: bool = False,
+    every: int = 1,
+    camera: str | None = None,
 ) -> Imported:
     """Write an episode file of a set of LeRobot or Minari, or of npz files. Frames stay as they are, bit for bit.
 
@@ -151,7 +164,9 @@ def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: I
     if not episode.instruction.strip():
         raise OwnVideosError("an episode has no sentence")
     if size is None and H != W:
-        raise OwnVideosError(f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)")
+        raise OwnVideosError(
+            f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)"
+        )
     if size not in (None, H) or H != W:
         frames, said = to_square(episode.frames, size or H, crop)
         episode = replace(episode, frames=frames, segmentation=None, position=None, objects=(), questions=())
@@ -159,7 +174,11 @@ def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: I
     if every == 1:
         return episode
     done.say("this set", [f"left out its actions and rewards, for --every {every} takes frames away"])
-    kept = {name: v[::every] for name in ("frames", "segmentation", "state") if (v := getattr(episode, name)) is not None}
+    kept = {
+        name: v[::every]
+        for name in ("frames", "segmentation", "state")
+        if (v := getattr(episode, name)) is not None
+    }
     return replace(episode, **kept, action=None, reward=None, primitives=())
 
 
@@ -271,13 +290,20 @@ def _to_lerobot(episodes: EpisodeFile, out: Path, fps: int) -> list[str]:
     }  # fmt: skip
     (out / "meta/episodes/chunk-000").mkdir(parents=True)
     (out / "meta/info.json").write_text(json.dumps(info, indent=4))
-    (out / "meta/stats.json").write_text(json.dumps({name: of.values() for name, of in stats.items()}, indent=4))
-    kept = [{name: v for name, v in row.items() if not name.startswith(OURS) or v is not None} for row in listed]
+    (out / "meta/stats.json").write_text(
+        json.dumps({name: of.values() for name, of in stats.items()}, indent=4)
+    )
+    kept = [
+        {name: v for name, v in row.items() if not name.startswith(OURS) or v is not None} for row in listed
+    ]
     parquet.write_table(pa.Table.from_pylist(kept), out / "meta/episodes/chunk-000/file-000.parquet")
     table = pa.table({"task_index": range(len(tasks)), "task": tasks})
     # LeRobot reads it with pandas, and the sentences as the table's index.
-    as_pandas = {"index_columns": ["task"], "column_indexes": [], "columns": [], "pandas_version": "2.0.0"}
-    parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet")
+    column = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    as_pandas = {"index_columns": ["task"], "column_indexes": [], "columns": [column], "pandas_version": "2.0.0"}
+    parquet.write_table(
+        table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet"
+    )
     return []
 
 
@@ -311,7 +337,9 @@ class _Stats:
 
     def values(self) -> dict[str, Any]:
         """As in `meta/stats.json`."""
-        frames, counts, sums, squares, least, most = (np.stack(part) for part in zip(*self.parts, strict=True))
+        frames, counts, sums, squares, least, most = (
+            np.stack(part) for part in zip(*self.parts, strict=True)
+        )
         mean = sums.sum(0) / counts.sum()
         std = np.sqrt(np.maximum(squares.sum(0) / counts.sum() - mean**2, 0))
         found = {"min": least.min(0), "max": most.max(0), "mean": mean, "std": std}
@@ -337,7 +365,9 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
         tables = [parquet.read_table(path) for path in sorted((source / "meta/episodes").glob("*/*.parquet"))]
         listed = [row for table in tables for row in table.to_pylist()]
     if len(listed) != info["total_episodes"]:
-        raise OwnVideosError(f"info.json promises {info['total_episodes']} episodes, and {len(listed)} are listed")
+        raise OwnVideosError(
+            f"info.json promises {info['total_episodes']} episodes, and {len(listed)} are listed"
+        )
     film = _Film()
     for row in listed:
         index = row["episode_index"]
@@ -346,17 +376,26 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
         path = source / info["data_path"].format(**where)
         table = parquet.read_table(path, filters=[("episode_index", "=", index)])
         if table.num_rows != row["length"]:
-            raise OwnVideosError(f"{path}: {table.num_rows} frames of episode {index}, and {row['length']} are listed")
+            raise OwnVideosError(
+                f"{path}: {table.num_rows} frames of episode {index}, and {row['length']} are listed"
+            )
         if features[camera]["dtype"] == "image":
             frames = np.stack([_picture(source, cell) for cell in table[camera].to_pylist()])
         else:
             name = f"videos/{camera}/"
-            where |= {"chunk_index": row.get(f"{name}chunk_index"), "file_index": row.get(f"{name}file_index")}
+            where |= {
+                "chunk_index": row.get(f"{name}chunk_index"),
+                "file_index": row.get(f"{name}file_index"),
+            }
             begin = round(row.get(f"{name}from_timestamp", 0) * fps)
             frames = film.read(source / info["video_path"].format(**where), begin, row["length"])
         columns = {
             ours: np.array(table[theirs].to_pylist(), np.float32)
-            for ours, theirs in (("action", "action"), ("state", "observation.state"), ("reward", "next.reward"))
+            for ours, theirs in (
+                ("action", "action"),
+                ("state", "observation.state"),
+                ("reward", "next.reward"),
+            )
             if theirs in table.column_names
         }
         for name in ("action", "state"):
@@ -398,7 +437,9 @@ class _Film:
 
 def _minari_data(source: Path) -> Path | None:
     for folder in (source / "data", source):
-        if (folder / "metadata.json").is_file() and "observation_space" in (folder / "metadata.json").read_text():
+        if (folder / "metadata.json").is_file() and "observation_space" in (
+            folder / "metadata.json"
+        ).read_text():
             return folder
     return None
 
@@ -414,7 +455,9 @@ def _to_minari(episodes: EpisodeFile, out: Path, name: str) -> list[str]:
         )
     spaces: dict[str, Any] = {
         "rgb": gym.spaces.Box(0, 255, (side, side, 3), np.uint8),
-        "instruction": gym.spaces.Text(max(map(len, episodes.instructions)), charset="".join(sorted(set(text)))),
+        "instruction": gym.spaces.Text(
+            max(map(len, episodes.instructions)), charset="".join(sorted(set(text)))
+        ),
     }
     if first.state is not None:
         spaces["proprio"] = gym.spaces.Box(-np.inf, np.inf, first.state.shape[1:], np.float32)
@@ -465,7 +508,9 @@ def _from_minari(source: Path, done: Imported) -> Iterator[Episode]:
     if storage.jpeg_encoding:
         done.say("this set", ["its frames were stored as JPEG, so they are not what was seen bit for bit"])
     numbers = range(storage.total_episodes)
-    for found, known in zip(storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True):
+    for found, known in zip(
+        storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True
+    ):
         seen, options = found["observations"], known.get("options", {})
         seen = seen if isinstance(seen, dict) else {"": seen}
         columns: dict[str, Any] = {}
@@ -484,4 +529,3 @@ def _from_minari(source: Path, done: Imported) -> Iterator[Episode]:
             success=None if success is None else bool(success),
             primitives=tuple(json.loads(options.get("primitives", "[]"))), **columns,
         )  # fmt: skip
-
