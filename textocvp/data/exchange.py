@@ -299,8 +299,19 @@ def _to_lerobot(episodes: EpisodeFile, out: Path, fps: int) -> list[str]:
     parquet.write_table(pa.Table.from_pylist(kept), out / "meta/episodes/chunk-000/file-000.parquet")
     table = pa.table({"task_index": range(len(tasks)), "task": tasks})
     # LeRobot reads it with pandas, and the sentences as the table's index.
-    column = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    as_pandas = {"index_columns": ["task"], "column_indexes": [], "columns": [column], "pandas_version": "2.0.0"}
+    column = {
+        "name": "task",
+        "field_name": "task",
+        "pandas_type": "unicode",
+        "numpy_type": "object",
+        "metadata": None,
+    }
+    as_pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [column],
+        "pandas_version": "2.0.0",
+    }
     parquet.write_table(
         table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet"
     )

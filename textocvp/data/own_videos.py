@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import h5py
 import imageio.v3 as iio
 import numpy as np
+from imageio_ffmpeg import get_ffmpeg_exe
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
@@ -175,6 +177,10 @@ def _read_video(path: Path, size: int, crop: bool, every: int) -> tuple[NDArray[
             count += 1
         if (promised := _promised(path)) and count < min(HEADER_TRUST * promised, promised - 1):
             said.append(f"cut short: {count} of the {promised} frames that its header promises can be read")
+        elif complaint := _complaint(path):
+            said.append(
+                f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}"
+            )
     if not frames:
         return np.zeros((0, size, size, 3), np.uint8), said
     whole, how = to_square(np.stack(frames), size, crop)
@@ -198,6 +204,15 @@ def _promised(path: Path) -> int:
     header = iio.immeta(path, plugin="FFMPEG")
     count = header.get("fps", 0) * header.get("duration", 0)
     return round(count) if np.isfinite(count) else 0
+
+
+def _complaint(path: Path) -> str:
+    """The first error of decoding a video file that yields frames all the same; empty if there is none."""
+    if path.suffix.lower() == ".gif":
+        return ""
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-map", "0:v:0", "-f", "null", "-"]
+    told = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
+    return re.sub(r"^\[.*?\] ", "", next(iter(told.stderr.splitlines()), ""))
 
 
 def _by_number(path: Path) -> list[tuple[bool, int, str]]:
