@@ -78,7 +78,7 @@ class Episode(Truth):
     reset_options: dict[str, Any] | None = None
     """What the simulator's `reset` was given beside the seed, if it is known."""
     action: NDArray[np.float32] | None = None
-    """(T, A) what was done from each frame on; the last leads to no frame. Collected files: the tool's motion, A = 5."""
+    """(T, A) what was done from each frame on; the last leads to no frame. Collected files: tool motions, A = 5."""
     reward: NDArray[np.float32] | None = None
     """(T,) for what was done from each frame on."""
     state: NDArray[np.float32] | None = None
