@@ -400,7 +400,7 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
             }
             begin = round(row.get(f"{name}from_timestamp", 0) * fps)
             frames = film.read(source / info["video_path"].format(**where), begin, row["length"])
-        columns = {
+        columns: dict[str, Any] = {
             ours: np.array(table[theirs].to_pylist(), np.float32)
             for ours, theirs in (
                 ("action", "action"),
