@@ -183,6 +183,7 @@ class RecordedEpisode:
     options: dict[str, Any]  # of `reset`
     arrays: dict[str, NDArray[Any]]  # over frames (T, ...), named as in the file, not padded for objects
     sentence: int = 0  # its number in its scene
+    primitives: tuple[dict[str, Any], ...] = ()  # `frame` at which each begins, and `action`, as in the file
     supports: tuple[Supports, Supports] = ((), ())  # before and after it, by object, with "any-sentence"
 
 
@@ -213,16 +214,20 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
     for sentence in range(config.sentences):
         pair = allowed[int(rng.integers(len(allowed)))]
         first, before = _last_frame(info), info["supports"]
-        info = env.step(expert.primitive(pair))[4]
+        relation, action = task.relation(pair), expert.primitive(pair)
+        was = relation.fulfilled(env.world, env.robot, pair)
+        info = env.step(action)[4]
+        success = relation.fulfilled(env.world, env.robot, pair)
         yield RecordedEpisode(
             seed=seed,
             instruction=task.scene(objects, (pair,)).instruction,
             objects=_named(info),
             questions=task.questions(with_supports(objects, before)),
-            success=task.relation(pair).fulfilled(env.world, env.robot, pair),
+            success=success,
             factors=info["factors"],
             options=options,
-            arrays=_arrays([first, info]),
+            arrays=_arrays([first, info], [float(success) - float(was)]),
+            primitives=_primitives([first, info], [action]),
             sentence=sentence,
             supports=(before, info["supports"]),
         )
@@ -233,7 +238,12 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
     seed = SPLITS[config.split].seed(episode)
     options = config.options(seed)
     _, info = env.reset(seed=seed, options=options)
-    infos = [info, *(env.step(action)[4] for action in Expert(env).actions())]
+    infos, actions, rewards = [info], [], []
+    for action in Expert(env).actions():
+        _, reward, _, _, info = env.step(action)
+        infos.append(info)
+        actions.append(action)
+        rewards.append(float(reward))
     return RecordedEpisode(
         seed=seed,
         instruction=info["instruction"],
@@ -242,7 +252,8 @@ def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> Rec
         success=bool(infos[-1]["is_success"]),
         factors=info["factors"],
         options=options,
-        arrays=_arrays(infos),
+        arrays=_arrays(infos, rewards),
+        primitives=_primitives(infos, actions),
     )
 
 
@@ -288,14 +299,32 @@ def _named(info: dict[str, Any]) -> tuple[dict[str, Any], ...]:
     return tuple({key: item[key] for key in ("id", "label", "kind", "color")} for item in info["objects"])
 
 
-def _arrays(infos: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
-    """All frames of some steps, and what they show."""
+def _arrays(infos: list[dict[str, Any]], rewards: list[float]) -> dict[str, NDArray[Any]]:
+    """All frames of some steps, what they show, and what was done; `rewards` are of all steps but the first."""
     states = [each["frame_states"] for each in infos]
+    arrays = {name: np.concatenate([state[name] for state in states]) for name in states[0]}
+    # A frame has the motion that follows it, where the recorder has the one that led to it.
+    arrays["action"] = np.concatenate([arrays.pop("motion")[1:], np.zeros((1, 5), np.float32)])
+    arrays["reward"] = np.zeros(len(arrays["action"]), np.float32)
+    arrays["reward"][_ends(infos)[1:] - 1] = rewards
     return {
         "frames": np.concatenate([each["frames"] for each in infos]),
         "segmentation": np.concatenate([each["frame_segmentations"] for each in infos]),
-        **{name: np.concatenate([state[name] for state in states]) for name in states[0]},
+        **arrays,
     }
+
+
+def _ends(infos: list[dict[str, Any]]) -> NDArray[np.int64]:
+    """The number of the last frame of each step."""
+    return np.cumsum([len(each["frames"]) for each in infos]) - 1
+
+
+def _primitives(
+    infos: list[dict[str, Any]], actions: list[NDArray[np.float32]]
+) -> tuple[dict[str, Any], ...]:
+    """The primitives of an episode, each with the number of the frame before it moves."""
+    pairs = zip(_ends(infos)[:-1].tolist(), actions, strict=True)
+    return tuple({"frame": frame, "action": action.tolist()} for frame, action in pairs)
 
 
 def _last_frame(info: dict[str, Any]) -> dict[str, Any]:
@@ -320,6 +349,8 @@ ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "segmentation": ((SIDE, SIDE), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "arm": ((6,), "f4", 256, {}),
     "gripper": ((5,), "f4", 256, {}),
+    "action": ((5,), "f4", 256, {}),
+    "reward": ((), "f4", 1024, {}),
     "object_position": ((MAX_OBJECTS, 3), "f4", 256, _POSE),
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
@@ -335,6 +366,7 @@ _COLUMNS: Columns = {
     "factors": (TEXT, lambda episode: json.dumps(episode.factors)),
     "options": (TEXT, lambda episode: json.dumps(episode.options)),
     "success": ("?", lambda episode: episode.success),
+    "primitives": (TEXT, lambda episode: json.dumps(episode.primitives)),
 }
 _SUPPORTS = np.dtype(("i1", (MAX_OBJECTS,)))
 # Those that files of "any-sentence" have besides.
@@ -361,7 +393,7 @@ def merge(path: Path, config: World, pieces: Iterable[Path], workshop: Path) -> 
             for piece in pieces:
                 with h5py.File(piece, "r") as source:
                     names = [*config.arrays, *(f"episode/{name}" for name in config.columns)]
-                    # A file that was begun before there were `options` goes on without.
+                    # A file that was begun before there were `options` or actions goes on without.
                     _append(file, {name: source[name][:] for name in names if name in file})
 
 

@@ -216,6 +216,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._simulator = (image_size, physics_hz, render_stride)
         self._start_simulator()
         self._film: list[NDArray[np.uint8]] = []  # for `render`
+        self._motion = np.zeros(5, np.float32)  # the latest
         self._start: tuple[Setup, Scene, Joints] | None = None  # what was built
         self._actions: list[NDArray[np.float32]] = []  # since the reset
         self._goal_rgb = np.zeros((image_size, image_size, 3), np.uint8)
@@ -384,14 +385,14 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
     def _show(self, setup: Setup, scene: Scene, joints: Joints) -> None:
         """Start anew with ``scene``, and take its first frame."""
         self._build(setup, scene, joints)
-        self._film = []
+        self._film, self._motion = [], np.zeros(5, np.float32)
         self._recorder.restart()
         self._capture()
         self._remember()
 
     def _capture(self) -> None:
         """Take a frame of this moment."""
-        self._recorder.capture()
+        self._recorder.capture(self._motion)
         if self.render_mode == "rgb_array_list":
             self._film.append(self._picture())
 
@@ -409,6 +410,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._start, self._actions = (setup, scene, joints), []
 
     def _move(self, action: Action) -> None:
+        self._motion = action
         self.robot.move(action[:3], float(action[3]), bool(action[4] > 0.5))
 
     def _fulfilled(self) -> list[bool]:

@@ -136,19 +136,36 @@ class DataCommand:
 
 @dataclass
 class ImportCommand:
-    """Make an episode file of a folder of videos, or of folders of pictures, with a sentence each."""
+    """Make an episode file of videos or folders of pictures with a sentence each, or of a LeRobot or Minari set."""
 
     source: tyro.conf.Positional[Path]
-    """Folder with the videos, and captions.json, captions.csv or captions.txt: name and sentence of each. Or
-    CATER-GEN-v2's list of captions, such as FOLDER/train_explicit.json."""
+    """Folder with the videos, and captions.json, captions.csv or captions.txt: name and sentence of each. Or the folder
+    of a LeRobot (v2, v3) or Minari set, of CLIPort's npz files, or CATER-GEN-v2's list of captions, such as
+    FOLDER/train_explicit.json."""
     out: Path
     """The episode file."""
-    size: int = 64
-    """Height and width of its frames."""
+    size: int | None = None
+    """Height and width of its frames; by default 64, and of a set its own."""
     crop: bool = False
     """Cut off what does not fit a square; otherwise it gets a border."""
     every: int = 1
     """Take every so many frames."""
+    camera: str | None = None
+    """Whose pictures to take of a LeRobot set with several cameras; by default the first's."""
+
+
+@dataclass
+class ExportCommand:
+    """Write an episode file as a set of another project: frames, sentences, actions, rewards and seeds, lossless."""
+
+    file: tyro.conf.Positional[Path]
+    """The episode file."""
+    to: Literal["lerobot", "minari"]
+    """Whose: LeRobot v3.0 (needs pyarrow), or Minari (needs minari)."""
+    out: Path
+    """The folder to write, which must not exist; Minari's is named as the set, such as tabletop-v0."""
+    fps: int = 15
+    """Frames a second, which LeRobot wants to know."""
 
 
 @dataclass
@@ -161,7 +178,7 @@ class DescribeCommand:
 
 @dataclass
 class CheckCommand:
-    """Say what is wrong in an episode file; exit status 1 if anything is."""
+    """Say what is wrong in an episode file; exit status 1 if anything is. Notes are not wrong."""
 
     file: tyro.conf.Positional[Path]
     """The file, a folder of CLIPort's npz files, or CATER-GEN-v2's list of captions."""
@@ -181,6 +198,7 @@ class PreviewCommand:
 
 DataAction = Union[  # noqa: UP007
     Annotated[ImportCommand, tyro.conf.subcommand("import")],
+    Annotated[ExportCommand, tyro.conf.subcommand("export")],
     Annotated[DescribeCommand, tyro.conf.subcommand("info")],
     Annotated[CheckCommand, tyro.conf.subcommand("check")],
     Annotated[PreviewCommand, tyro.conf.subcommand("preview")],
@@ -296,28 +314,44 @@ def _train(arguments: list[str]) -> None:
 
 
 def _data(arguments: list[str]) -> int:
-    from textocvp.data import open_episodes, own_videos
-    from textocvp.data.cater import CaterEpisodes
+    from textocvp.data import exchange, open_episodes, own_videos
 
     action: Any = tyro.cli(
-        DataAction, prog="textocvp data", description="Episode files of your own videos.", args=arguments
+        DataAction,
+        prog="textocvp data",
+        description="Episode files of your own videos, and sets of other projects.",
+        args=arguments,
     )
     try:
         if isinstance(action, ImportCommand):
-            source: Any = action.source
-            if CaterEpisodes.detect(source):
-                source = CaterEpisodes(source, size=action.size, crop=action.crop)
-            done = own_videos.import_videos(
-                source, action.out, size=action.size, crop=action.crop, every=action.every
-            )
+            how: dict[str, Any] = {"size": action.size, "crop": action.crop, "every": action.every}
+            if exchange.kind_of(action.source) == "videos":
+                done = own_videos.import_videos(
+                    action.source, action.out, **how | {"size": action.size or 64}
+                )
+            else:
+                done = exchange.import_set(action.source, action.out, **how, camera=action.camera)
             for line in done.left_out:
                 print(f"left out: {line}", file=sys.stderr)
-            print(f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames")
+            print(
+                "\n".join(
+                    [*done.lines, f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames"]
+                )
+            )
+            return 0
+        if not action.file.exists():
+            raise Mistake(f"there is no file or folder {action.file} (looked for in {Path.cwd()})")
+        if isinstance(action, ExportCommand):
+            for line in exchange.export(action.file, action.to, action.out, action.fps):
+                print(f"left out: {line}", file=sys.stderr)
+            print(f"wrote {action.out}")
             return 0
         with open_episodes(action.file) as episodes:
             if isinstance(action, CheckCommand):
                 found = own_videos.problems(episodes, action.window)
                 print("\n".join(found) or "nothing is wrong")
+                if len(episodes) < 4:
+                    print(f"note: only {len(episodes)} episodes; figures measured on so few say little")
                 return 1 if found else 0
             print("\n".join(own_videos.describe(episodes)))
             if isinstance(action, PreviewCommand):

@@ -13,14 +13,14 @@ from textocvp.inputs import times_larger
 
 
 def read_picture(
-    path: Path | BinaryIO, image_size: tuple[int, int], *, resize: bool = False, crop: bool = False
+    path: Path | BinaryIO, image_size: tuple[int, int] | None, *, resize: bool = False, crop: bool = False
 ) -> tuple[NDArray[np.uint8], list[str]]:
     """A picture file as RGB (H, W, 3), 0..255, and what was done to it, in words.
 
     The orientation tag is obeyed, 16 bits become 8, transparency becomes white, gray becomes RGB.
 
     Args:
-        image_size: (H, W) of the model's frames.
+        image_size: (H, W) of the model's frames; None takes any, as it is.
         resize: bring it to that size, with a border where its shape is another.
         crop: bring it to that size, cut off at two sides where its shape is another.
 
@@ -35,6 +35,8 @@ def read_picture(
         if file.getexif().get(ExifTags.Base.Orientation, 1) != 1:
             said.append("turned it as its orientation tag says")
         picture = _eight_bits(ImageOps.exif_transpose(file), said)
+    if image_size is None:
+        return np.asarray(picture), said
     H, W = image_size
     before = f"{picture.width}x{picture.height}"
     if not (resize or crop):
@@ -44,16 +46,28 @@ def read_picture(
                 "whole multiple of it, or add --resize (with a border) or --crop (without its edges)"
             )
     elif picture.size != (W, H):
-        how = ""
-        if picture.width * H != W * picture.height:
-            how = "cut off its edges and " if crop else "added a border and "
-        if crop:
-            picture = ImageOps.fit(picture, (W, H), Image.Resampling.BOX)
-        else:
-            color = tuple(int(value) for value in np.median(_edge(picture), axis=0))
-            picture = ImageOps.pad(picture, (W, H), Image.Resampling.BOX, color=color)
-        said.append(f"{how}brought it from {before} to {W}x{H} pixels")
+        whole, how = bring_to_size(np.asarray(picture)[None], image_size, crop)
+        return whole[0], [*said, how]
     return np.asarray(picture), said
+
+
+def bring_to_size(
+    frames_T: NDArray[np.uint8], image_size: tuple[int, int], crop: bool = False
+) -> tuple[NDArray[np.uint8], str]:
+    """Frames (T, h, w, 3) at another size (T, H, W, 3), and what was done, in words.
+
+    The border, where the shape is another and nothing is cut off, has the colour of the first frame's edge.
+    """
+    (H, W), (h, w) = image_size, frames_T.shape[1:3]
+    how = ("cut off its edges and " if crop else "added a border and ") if w * H != W * h else ""
+    color = tuple(int(value) for value in np.median(_edge(frames_T[0]), axis=0))
+    taken = []
+    for frame in map(Image.fromarray, frames_T):
+        if crop:
+            taken.append(ImageOps.fit(frame, (W, H), Image.Resampling.BOX))
+        else:
+            taken.append(ImageOps.pad(frame, (W, H), Image.Resampling.BOX, color=color))
+    return np.stack([np.asarray(frame) for frame in taken]), f"{how}brought it from {w}x{h} to {W}x{H} pixels"
 
 
 def _eight_bits(picture: Image.Image, said: list[str]) -> Image.Image:
@@ -75,7 +89,6 @@ def _eight_bits(picture: Image.Image, said: list[str]) -> Image.Image:
     return picture.convert("RGB")
 
 
-def _edge(picture: Image.Image) -> NDArray[np.uint8]:
+def _edge(values_HW3: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The pixels (N, 3) at the edge of a picture, for a border that stands out little."""
-    values_HW3 = np.asarray(picture)
     return np.concatenate([values_HW3[0], values_HW3[-1], values_HW3[:, 0], values_HW3[:, -1]])

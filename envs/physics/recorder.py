@@ -16,7 +16,7 @@ class Recorder:
 
     A state is a dict of float32: `arm` (6,) joint angles in radians; `gripper` (5,) tip x, y, z in metres, yaw
     in radians, 1 if something is held; `object_position` (n, 3) metres; `object_orientation` (n, 4)
-    quaternions x y z w.
+    quaternions x y z w; `motion` (5,) that led here: dx, dy, dz in metres, dyaw in radians, suction; 0 after a reset.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -28,8 +28,8 @@ class Recorder:
         self.images: list[Image] = []
         self.states: list[dict[str, NDArray[np.float32]]] = []
 
-    def capture(self) -> None:
-        """Add the frame of this moment."""
+    def capture(self, motion: NDArray[np.float32]) -> None:
+        """Add the frame of this moment, and the motion that led to it."""
         robot = self._robot
         self.images.append(robot.world.render())
         position, orientation = robot.world.poses()
@@ -38,6 +38,7 @@ class Recorder:
             "gripper": np.array([*robot.tip(), robot.yaw, robot.holding >= 0]),
             "object_position": position,
             "object_orientation": orientation,
+            "motion": motion,
         }
         self.states.append({name: value.astype(np.float32) for name, value in state.items()})
 

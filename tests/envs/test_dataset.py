@@ -131,7 +131,7 @@ def test_the_file_says_what_its_labels_words_and_questions_are(whole: Path, env:
 def test_the_page_names_every_field(whole: Path) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     fields = [name for name in contents(whole) if name != "episode"]
-    assert len(fields) == 15 + 10
+    assert len(fields) == 15 + 3 + 10
     for name in fields:
         assert f"| `{name.removeprefix('@')}` |" in page, name
 
@@ -196,7 +196,7 @@ def test_sentences_follow_each_other_in_a_scene(sentences: Path) -> None:
 def test_the_page_names_the_fields_of_sentences(sentences: Path) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     fields = [name for name in contents(sentences) if name != "episode"]
-    assert len(fields) == 15 + 3 + 10
+    assert len(fields) == 15 + 3 + 3 + 10
     assert all(f"| `{name.removeprefix('@')}` |" in page for name in fields)
 
 
@@ -285,6 +285,52 @@ def test_a_file_can_be_extended(whole: Path, tmp_path: Path) -> None:
     collect(SMALL, 4, path)
     collect(SMALL, 14, path)
     assert contents(path) == contents(whole)
+
+
+def test_what_was_done_shows_the_same_frames_again(whole: Path) -> None:
+    ee = TabletopEnv("put_block_in_bowl", control="ee", image_size=16, render_stride=24, max_steps=99)
+    env = SMALL.make()
+    with EpisodeFile(whole) as file:
+        for index in (0, 5):
+            one = file.episode(index)
+            assert one.action is not None and one.reward is not None and one.state is not None
+            assert not one.action[-1].any() and one.action.dtype == np.float32
+            shown = [ee.reset(seed=one.seed, options=one.reset_options)[0]["rgb"]]
+            shown += [ee.step(action)[0]["rgb"] for action in one.action[:-1]]
+            assert np.array_equal(np.stack(shown), one.frames)
+            (primitive,) = one.primitives
+            env.reset(seed=one.seed, options=one.reset_options)
+            _, reward, _, _, info = env.step(np.array(primitive["action"], np.float32))
+            assert primitive["frame"] == 0 and np.array_equal(info["frames"], one.frames[1:])
+            assert np.flatnonzero(one.reward).tolist() == [len(one.frames) - 2] and one.reward[-2] == reward
+            assert one.state.shape == (len(one.frames), 11)
+    ee.close()
+    env.close()
+
+
+def test_actions_of_sentences(sentences: Path) -> None:
+    """Each from its own first frame, rewarded for what the sentence itself brings about."""
+    with EpisodeFile(sentences) as file, h5py.File(sentences) as stored:
+        for index, one in enumerate(file):
+            assert one.action is not None and one.reward is not None
+            assert one.action[0].any() and not one.action[-1].any(), "no motion of the sentence before"
+            assert [item["frame"] for item in one.primitives] == [0]
+            assert one.reward.sum() in ((0, 1) if one.success else (-1, 0)), index
+        assert np.array_equal(file.episode(0).action, stored["action"][: len(file.frames(0))])
+
+
+def test_a_file_from_before_there_were_actions_goes_on_without(whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "old.h5"
+    collect(SMALL, 4, path)
+    with h5py.File(path, "r+") as file:
+        for name in ("action", "reward", "episode/primitives"):
+            del file[name]
+    with EpisodeFile(path) as file:
+        one = file.episode(0)
+        assert one.action is None and one.reward is None and one.primitives == ()
+    collect(SMALL, 14, path)
+    wanted = {n: v for n, v in contents(whole).items() if n not in ("action", "reward", "episode/primitives")}
+    assert contents(path) == wanted
 
 
 def test_killed_again_and_again_it_loses_and_doubles_nothing(whole: Path, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ class CaterEpisodes(Episodes):
         """All frames (T, H, H, 3) of an episode; a ValueError that names the video if it is damaged inside."""
         video, wanted = self._videos[index], self.lengths[index]
         try:
-            frames = read_video(video, self.image_size, self.crop, every=1)
+            frames = read_video(video, self.image_size, self.crop, every=1)[0]
         except Exception as error:  # decoders raise whatever they like
             raise ValueError(f"{video}: it cannot be read ({str(error).splitlines()[0][:120]})") from error
         if len(frames) != wanted:

@@ -79,6 +79,14 @@ class Episode(Truth):
     """Whether the instruction was carried out, if that was judged."""
     reset_options: dict[str, Any] | None = None
     """What the simulator's `reset` was given beside the seed, if it is known."""
+    action: NDArray[np.float32] | None = None
+    """(T, A) what was done from each frame on; the last leads to no frame. Collected files: tool motions, A = 5."""
+    reward: NDArray[np.float32] | None = None
+    """(T,) for what was done from each frame on."""
+    state: NDArray[np.float32] | None = None
+    """(T, S) of the robot; in collected files S = 11: `arm` and `gripper`."""
+    primitives: tuple[dict[str, Any], ...] = ()
+    """Whole pick-and-places: the `frame` from which on, and the `action` [pick_x, pick_y, place_x, place_y], metres."""
 
 
 class Episodes(ABC):
@@ -250,6 +258,10 @@ class EpisodeFile(Episodes):
             seed=None if self.seeds is None else int(self.seeds[number]),
             success=None if self.success is None else bool(self.success[number]),
             reset_options=self._json("options", number) or None,
+            action=self._array("action", number),
+            reward=self._array("reward", number),
+            state=self._state(number),
+            primitives=tuple(self._json("primitives", number)),
             **vars(self.truth(number) or Truth()),
         )
 
@@ -351,6 +363,17 @@ class EpisodeFile(Episodes):
     def _rows(self, index: int) -> slice:
         number = self._number(index)
         return slice(int(self.starts[number]), int(self.starts[number] + self.lengths[number]))
+
+    def _array(self, name: str, number: int) -> NDArray[Any] | None:
+        file = self._open()
+        return file[name][self._rows(number)] if name in file else None
+
+    def _state(self, number: int) -> NDArray[Any] | None:
+        if (state := self._array("state", number)) is not None:
+            return state
+        parts = [self._array(name, number) for name in ("arm", "gripper")]
+        known = [part for part in parts if part is not None]
+        return np.concatenate(known, axis=1) if len(known) == 2 else None
 
     def _json(self, name: str, number: int) -> Any:
         index = self._open()["episode"]

@@ -5,26 +5,30 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+import subprocess
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import h5py
 import imageio.v3 as iio
 import numpy as np
+from imageio_ffmpeg import get_ffmpeg_exe
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from textocvp.data.episodes import Episode, Episodes, words_of
+from textocvp.data.episodes import Episodes, words_of
 from textocvp.files import replacing
-from textocvp.pictures import read_picture
+from textocvp.pictures import bring_to_size, read_picture
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 CAPTIONS = ("captions.json", "captions.csv", "captions.txt")
 SHOWN, MOMENTS = 12, 6  # episodes of a contact sheet, and frames of each
+LEAST_SHOWN, STRIP = 96, 18  # pixels: height of its frames, and of the line with the sentence above them
+WINDOW = 24  # frames that a predictor looks ahead while it learns, unless it is told otherwise
+HEADER_TRUST = 0.9  # fewer frames than this share of what the header says, and two: the file was cut short
 
 
 class OwnVideosError(ValueError):
@@ -38,6 +42,23 @@ class Imported:
     episodes: int = 0
     frames: int = 0
     left_out: list[str] = field(default_factory=list)  # a line for each video that was not taken
+    done: dict[str, list[str]] = field(
+        default_factory=dict
+    )  # what had to be changed or is doubtful: of which videos
+
+    def say(self, name: str, what: Sequence[str]) -> None:
+        """Note what was done to a video."""
+        for one in what:
+            if name not in (names := self.done.setdefault(one, [])):
+                names.append(name)
+
+    @property
+    def lines(self) -> list[str]:
+        """A line for each thing that was done, with the first video of which it is true."""
+        more = {
+            what: f" and {len(names) - 1} more" if len(names) > 1 else "" for what, names in self.done.items()
+        }
+        return [f"{names[0]}{more[what]}: {what}" for what, names in self.done.items()]
 
 
 def read_captions(folder: Path) -> dict[str, str]:
@@ -70,13 +91,10 @@ def read_captions(folder: Path) -> dict[str, str]:
     return {name.strip(): " ".join(sentence.split()) for name, sentence in found.items()}
 
 
-def import_videos(
-    source: Path | Episodes, out: Path, *, size: int = 64, crop: bool = False, every: int = 1
-) -> Imported:
+def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False, every: int = 1) -> Imported:
     """Write an episode file of the videos in a folder: video files, and folders of pictures in the order of names.
 
     Args:
-        source: the folder; or episodes of another format, whose frames have their size, with objects and positions.
         size: height and width of the frames in the file; pictures of other shapes get a border.
         crop: cut off what does not fit the square instead.
         every: take every so many frames.
@@ -84,21 +102,12 @@ def import_videos(
     Raises:
         OwnVideosError: if there is no video, no captions, or no video that can be used; nothing is written then.
     """
-    if isinstance(source, Path) and not source.is_dir():
+    if not source.is_dir():
         raise OwnVideosError(f"{source} is no folder of videos")
     if size < 8 or every < 1:
         raise OwnVideosError(f"size must be at least 8 and every at least 1, not {size} and {every}")
-    done = Imported()
-    videos: dict[str, Callable[[], Episode]]
-    if isinstance(source, Episodes):
-        size = source.image_size
-        videos = {f"episode {i}": partial(source.episode, i) for i in range(len(source))}
-        captions = dict(zip(videos, source.instructions, strict=True))
-    else:
-        captions = read_captions(source)
-        found = [one for one in sorted(source.iterdir()) if one.suffix.lower() in VIDEOS or one.is_dir()]
-        videos = {one.name: partial(_own_episode, one, size, crop, every) for one in found}
-        every = 1  # they take it themselves
+    captions, done = read_captions(source), Imported()
+    videos = [one for one in _seen(source) if one.suffix.lower() in VIDEOS or one.is_dir()]
     if not videos:
         raise OwnVideosError(f"{source} has no video ({', '.join(VIDEOS)}) and no folder of pictures")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -109,30 +118,30 @@ def import_videos(
         )
         lengths: list[int] = []
         sentences: list[str] = []
-        objects: list[str] = []
-        positions: list[NDArray[np.float32]] = []
-        for name, read in tqdm(videos.items(), desc="videos", unit="video"):
-            sentence = captions.get(name) or captions.get(Path(name).stem)
+        for path in tqdm(videos, desc="videos", unit="video"):
+            sentence = captions.get(path.name) or captions.get(path.stem)
             if not sentence:
-                done.left_out.append(f"{name}: the captions have no sentence for it")
+                done.left_out.append(f"{path.name}: the captions have no sentence for it")
                 continue
             try:
-                clip = read()
+                video, said = read_video(path, size, crop, every)
             except Exception as error:  # decoders raise whatever they like
-                done.left_out.append(f"{name}: it cannot be read ({str(error).splitlines()[0][:300]})")
+                done.left_out.append(f"{path.name}: it cannot be read ({str(error).splitlines()[0][:120]})")
                 continue
-            video = clip.frames[::every]
             if len(video) < 2:
-                done.left_out.append(f"{name}: {len(video)} frames, and an episode needs at least 2")
+                done.left_out.append(f"{path.name}: {len(video)} frames, and an episode needs at least 2")
                 continue
+            if len(video) > WINDOW + 1:
+                said.append(
+                    f"longer than {WINDOW + 1} frames, after which the predictor stops looking: take --every, "
+                    "or train it with more --frames"
+                )
+            done.say(path.name, said)
             frames.resize(len(frames) + len(video), axis=0)
             frames[-len(video) :] = video
             lengths.append(len(video))
             sentences.append(sentence)
-            if clip.position is not None:
-                objects.append(json.dumps([one._asdict() for one in clip.objects]))
-                positions.append(clip.position[::every])
-        known = {*videos, *(Path(name).stem for name in videos)}
+        known = {name for path in videos for name in (path.name, path.stem)}
         done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
         if not lengths:
             raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
@@ -140,32 +149,70 @@ def import_videos(
         file["episode/start"] = np.cumsum(lengths) - lengths
         file["episode/length"] = np.array(lengths)
         file["episode/instruction"] = sentences
-        if positions:
-            file["episode/objects"] = objects
-            room = max(8, *(one.shape[1] for one in positions))
-            placed = file.create_dataset("object_position", (sum(lengths), room, 3), "f4", fillvalue=np.nan)
-            for start, one in zip(file["episode/start"], positions, strict=True):
-                placed[start : start + len(one), : one.shape[1]] = one
     done.episodes, done.frames = len(lengths), sum(lengths)
     return done
 
 
-def _own_episode(path: Path, size: int, crop: bool, every: int) -> Episode:
-    return Episode(frames=read_video(path, size, crop, every), instruction="")
+def _seen(folder: Path) -> list[Path]:
+    """What is in a folder, without what systems leave in it (.DS_Store, ._x, __MACOSX)."""
+    return [one for one in sorted(folder.iterdir()) if not one.name.startswith((".", "__MACOSX"))]
 
 
-def read_video(path: Path, size: int, crop: bool, every: int) -> NDArray[np.uint8]:
-    """Square frames (T, size, size, 3) as `import_videos` takes them; raises whatever the decoder does."""
+def read_video(path: Path, size: int, crop: bool, every: int) -> tuple[NDArray[np.uint8], list[str]]:
+    """Frames (T, size, size, 3), and what was done to them, in words."""
+    said: list[str] = []
     if path.is_dir():
-        files = sorted((one for one in path.iterdir() if one.suffix.lower() in PICTURES), key=_by_number)[
-            ::every
-        ]
-        shots = [read_picture(one, (size, size), resize=not crop, crop=crop)[0] for one in files]
-        return np.stack(shots) if shots else np.zeros((0, size, size, 3), np.uint8)
-    fit = ImageOps.fit if crop else ImageOps.pad
-    frames = (frame for i, frame in enumerate(_frames(path)) if i % every == 0)
-    pictures = [np.asarray(fit(Image.fromarray(frame).convert("RGB"), (size, size))) for frame in frames]
-    return np.stack(pictures) if pictures else np.zeros((0, size, size, 3), np.uint8)
+        files = sorted((one for one in _seen(path) if one.suffix.lower() in PICTURES), key=_by_number)
+        read = [read_picture(one, None) for one in files[::every]]
+        said += dict.fromkeys(what for _, of_one in read for what in of_one)
+        frames = [frame for frame, _ in read]
+        if len({frame.shape for frame in frames}) > 1:
+            sizes = sorted({f"{frame.shape[1]}x{frame.shape[0]}" for frame in frames})
+            raise ValueError(f"its pictures differ in size: {', '.join(sizes)}")
+    else:
+        frames, count = [], 0
+        for frame in video_frames(path):
+            if count % every == 0:
+                frames.append(frame)
+            count += 1
+        if (promised := _promised(path)) and count < min(HEADER_TRUST * promised, promised - 1):
+            said.append(f"cut short: {count} of the {promised} frames that its header promises can be read")
+        elif complaint := _complaint(path):
+            said.append(
+                f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}"
+            )
+    if not frames:
+        return np.zeros((0, size, size, 3), np.uint8), said
+    whole, how = to_square(np.stack(frames), size, crop)
+    return whole, said + how
+
+
+def to_square(
+    frames_T: NDArray[np.uint8], size: int, crop: bool = False
+) -> tuple[NDArray[np.uint8], list[str]]:
+    """Frames (T, size, size, 3), with a border or cut off, and what was done, in words."""
+    if frames_T.shape[1:3] == (size, size):
+        return frames_T, []
+    whole, how = bring_to_size(frames_T, (size, size), crop)
+    return whole, [how]
+
+
+def _promised(path: Path) -> int:
+    """The number of frames that follows from rate and duration in a video's header; 0 where it says nothing."""
+    if path.suffix.lower() == ".gif":
+        return 0
+    header = iio.immeta(path, plugin="FFMPEG")
+    count = header.get("fps", 0) * header.get("duration", 0)
+    return round(count) if np.isfinite(count) else 0
+
+
+def _complaint(path: Path) -> str:
+    """The first error of decoding a video file that yields frames all the same; empty if there is none."""
+    if path.suffix.lower() == ".gif":
+        return ""
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-map", "0:v:0", "-f", "null", "-"]
+    told = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
+    return re.sub(r"^\[.*?\] ", "", next(iter(told.stderr.splitlines()), ""))
 
 
 def _by_number(path: Path) -> list[tuple[bool, int, str]]:
@@ -175,7 +222,8 @@ def _by_number(path: Path) -> list[tuple[bool, int, str]]:
     ]
 
 
-def _frames(path: Path) -> Iterator[NDArray[np.uint8]]:
+def video_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """The frames (H, W, 3) of a video file, RGB."""
     if path.suffix.lower() == ".gif":
         yield from iio.imiter(path, mode="RGB")
     else:
@@ -207,15 +255,9 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
     Args:
         window: frames that the predictor to be trained can look ahead.
     """
-    found, damaged = [], list(episodes.problems)
-    if len(episodes) < 4:
-        found.append(f"{len(episodes)} episodes: figures over fewer than 4 say little")
+    found = []
     for index, text in enumerate(episodes.instructions):
-        try:
-            frames = episodes.frames(index)
-        except (OSError, ValueError) as error:
-            damaged.append(str(error))
-            continue
+        frames = episodes.frames(index)
         here = f"episode {index} ({text!r})"
         if not any(letter.isalpha() for letter in text):
             found.append(f"{here}: the sentence has no words")
@@ -229,17 +271,19 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
             found.append(
                 f"{here}: {len(frames)} frames; the predictor looks {window} ahead: take --every, or a wider window"
             )
-    if damaged:
-        total = len(episodes) + len(episodes.problems)
-        found = [f"{len(damaged)} of {total} episodes cannot be used:", *damaged, *found]
     return found
 
 
 def contact_sheet(episodes: Episodes) -> NDArray[np.uint8]:
-    """Moments of the first episodes, a row each: (rows, columns, 3) uint8."""
+    """Moments of the first episodes, a row each under its sentence: (rows, columns, 3) uint8."""
     rows = []
     for index in range(min(SHOWN, len(episodes))):
         frames = episodes.frames(index)
+        factor = max(1, -(-LEAST_SHOWN // frames.shape[1]))
         moments: Sequence[int] = np.linspace(0, len(frames) - 1, MOMENTS).round().astype(int).tolist()
-        rows.append(np.concatenate([frames[t] for t in moments], axis=1))
+        row = np.concatenate([frames[t] for t in moments], axis=1).repeat(factor, 0).repeat(factor, 1)
+        line = Image.new("RGB", (row.shape[1], STRIP), "white")
+        text = f"{index}: {episodes.instructions[index]}"
+        ImageDraw.Draw(line).text((3, 1), text, "black", ImageFont.load_default(STRIP - 6))
+        rows += [np.asarray(line), row]
     return np.concatenate(rows)

@@ -15,7 +15,13 @@ import pytest
 
 from textocvp.cli import main
 from textocvp.data import open_episodes
-from textocvp.data.own_videos import OwnVideosError, import_videos, problems, read_captions
+from textocvp.data.own_videos import (
+    OwnVideosError,
+    contact_sheet,
+    import_videos,
+    problems,
+    read_captions,
+)
 
 PAGE = Path(__file__).parents[3] / "docs/own-videos.md"
 SENTENCES = ("put the red block in the blue bowl", "put the green block in the blue bowl")
@@ -60,7 +66,11 @@ def test_the_commands_of_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
     for command in commands:
         small = ["--steps", "2", "--batch", "2"] if command[0] == "train" else []
         assert main([*command, *small]) == 0, capsys.readouterr().err
-    assert Path("imagined.gif").stat().st_size > 1000 and iio.imread("own/preview.png").shape == (256, 384, 3)
+    assert Path("imagined.gif").stat().st_size > 1000 and iio.imread("own/preview.png").shape == (
+        4 * (18 + 128),
+        768,
+        3,
+    )
     with open_episodes("own/train.h5") as episodes:
         for i in range(3):
             np.testing.assert_array_equal(episodes.frames(i), video(i))
@@ -117,3 +127,80 @@ def test_check_finds_what_would_be_learned_in_vain(tmp_path: Path, capsys) -> No
     assert "episode 0" in said and "it is black" in said
     assert "nothing ever changes" in said and "it is gray" in said
     assert main(["data", "info", str(tmp_path / "missing.h5")]) == 1
+    assert f"there is no file or folder {tmp_path / 'missing.h5'}" in capsys.readouterr().err
+
+
+def test_few_videos_are_noted_and_not_wrong(tmp_path: Path, capsys) -> None:
+    import_videos(fill(tmp_path / "videos", 2), tmp_path / "own.h5")
+    assert main(["data", "check", str(tmp_path / "own.h5")]) == 0
+    assert capsys.readouterr().out.endswith("note: only 2 episodes; figures measured on so few say little\n")
+
+
+def test_what_was_done_to_videos_is_said(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "videos"
+    for name in ("a", "b"):
+        (folder / name).mkdir(parents=True)
+        for t, frame in enumerate(video(0, length=30)):
+            iio.imwrite(folder / name / f"{t}.png", frame[:48, ..., 0])
+    (folder / ".hidden").mkdir()
+    (folder / "._a.mp4").write_bytes(b"left by a system")
+    (folder / "a/._0.png").write_bytes(b"left by a system")
+    (folder / "captions.txt").write_text("a put it there\nb put it back\n")
+    assert main(["data", "import", str(folder), "--out", str(tmp_path / "own.h5")]) == 0
+    out, error = capsys.readouterr()
+    assert "left out" not in error and "wrote" in out
+    assert "a and 1 more: took its gray for all three colours" in out
+    assert "a and 1 more: added a border and brought it from 64x48 to 64x64 pixels" in out
+    assert "a and 1 more: longer than 25 frames" in out and "take --every" in out
+    iio.imwrite(folder / "b/7.png", video(0)[0])
+    done = import_videos(folder, tmp_path / "own.h5")
+    assert done.left_out == ["b: it cannot be read (its pictures differ in size: 64x48, 64x64)"]
+
+
+def test_borders_of_videos_and_of_pictures_are_alike(tmp_path: Path) -> None:
+    folder = tmp_path / "videos"
+    (folder / "a").mkdir(parents=True)
+    frames = video(0)[:, :48]
+    frames[6:, :, :8] = 250  # something comes in at the edge: the border stays
+    for t, frame in enumerate(frames):
+        iio.imwrite(folder / f"a/{t}.png", frame)
+    iio.imwrite(folder / "b.mp4", frames, plugin="FFMPEG", fps=6, quality=10)
+    (folder / "captions.txt").write_text("a put it there\nb put it back\n")
+    import_videos(folder, tmp_path / "own.h5")
+    with open_episodes(tmp_path / "own.h5") as episodes:
+        pictures, film = episodes.frames(0), episodes.frames(1)
+        assert (pictures[:, :8] == 150).all() and (pictures[:, -8:] == 150).all()
+        assert np.abs(film[:, :8].astype(int) - 150).max() <= 4
+
+
+@pytest.mark.parametrize("ending", [".avi", ".mkv"])
+def test_a_video_that_was_cut_short_is_named(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"videos/a{ending}"
+    path.parent.mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
+    iio.imwrite(path, noise, plugin="FFMPEG", fps=10)
+    (path.parent / "captions.txt").write_text("a put it there\n")
+    assert not any("cut short" in line for line in import_videos(path.parent, tmp_path / "own.h5").lines)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    done = import_videos(path.parent, tmp_path / "own.h5")
+    assert done.episodes == 1 and done.frames < 36
+    (said,) = (line for line in done.lines if "cut short" in line)
+    if ending == ".mkv":  # its header says how long it is
+        assert (
+            said == f"a.mkv: cut short: {done.frames} of the 40 frames that its header promises can be read"
+        )
+    else:
+        assert said.startswith(
+            f"a.avi: damaged or cut short: {done.frames} frames can be read, and the decoder"
+        )
+
+
+def test_a_contact_sheet_has_the_sentences(tmp_path: Path) -> None:
+    import_videos(fill(tmp_path / "videos", 2), tmp_path / "own.h5")
+    with open_episodes(tmp_path / "own.h5") as episodes:
+        sheet = contact_sheet(episodes)
+        captions = [sheet[at : at + 18] for at in (0, 18 + 128)]
+        assert all((line < 100).sum() > 300 and line[0, 0].tolist() == [255] * 3 for line in captions)
+        assert (captions[0] != captions[1]).any(), "red and green"
+        np.testing.assert_array_equal(sheet[18 : 18 + 128 : 2, :128:2], video(0)[0])
