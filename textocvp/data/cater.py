@@ -25,7 +25,7 @@ class CaterEpisodes(Episodes):
     Args:
         path: FOLDER/train_explicit.json, or FOLDER/train, which means the same, or a folder with a single list.
         size: height and width that frames are brought to.
-        crop: cut off what does not fit a square; otherwise it gets a black border.
+        crop: cut off what does not fit a square; otherwise it gets a border in the colour of its edge.
 
     Raises:
         FileNotFoundError: when there is no list.
@@ -65,7 +65,7 @@ class CaterEpisodes(Episodes):
         self.problems = tuple(problems)
         said = [f"left out: {problem}" for problem in problems]
         if others := sorted({*sizes} - {(size, size)}):
-            how = "cut off to fit" if crop else "with a black border where they are not square"
+            how = "cut off to fit" if crop else "with a border where they are not square"
             said.append(f"frames of {', '.join(f'{W}x{H}' for W, H in others)} become {size}x{size}, {how}")
         for line in said:
             warnings.warn(line, UserWarning, stacklevel=2)

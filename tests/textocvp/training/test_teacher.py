@@ -135,7 +135,7 @@ def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.Mon
 
 
 def test_on_a_floor_in_uneven_light_shadows_are_floor_and_gray_things_are_not() -> None:
-    y, x = np.mgrid[-1 : 1 : 48j, -1 : 1 : 48j]
+    y, x = np.mgrid[-1:1:48j, -1:1:48j]
     floor = 165 * (1 - 0.1 * (x**2 + y**2))
     frames = np.repeat(floor[None, ..., None], 3, 3).repeat(6, 0)
     labels = np.zeros((6, 48, 48), int)
