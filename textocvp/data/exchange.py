@@ -197,7 +197,7 @@ def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: I
     done.say("this set", [f"left out its actions and rewards, for --every {every} takes frames away"])
     kept = {
         name: v[::every]
-        for name in ("frames", "segmentation", "state")
+        for name in ("frames", "segmentation", "state", "position")
         if (v := getattr(episode, name)) is not None
     }
     return replace(episode, **kept, action=None, reward=None, primitives=())

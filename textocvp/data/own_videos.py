@@ -255,9 +255,14 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
     Args:
         window: frames that the predictor to be trained can look ahead.
     """
-    found = []
+    found: list[str] = []
+    damaged = list(episodes.problems)
     for index, text in enumerate(episodes.instructions):
-        frames = episodes.frames(index)
+        try:
+            frames = episodes.frames(index)
+        except ValueError as error:
+            damaged.append(str(error))
+            continue
         here = f"episode {index} ({text!r})"
         if not any(letter.isalpha() for letter in text):
             found.append(f"{here}: the sentence has no words")
@@ -271,6 +276,9 @@ def problems(episodes: Episodes, window: int | None = None) -> list[str]:
             found.append(
                 f"{here}: {len(frames)} frames; the predictor looks {window} ahead: take --every, or a wider window"
             )
+    if damaged:
+        total = len(episodes) + len(episodes.problems)
+        found = [f"{len(damaged)} of {total} episodes cannot be used:", *damaged, *found]
     return found
 
 
