@@ -1,0 +1,141 @@
+"""The study of CATER: how an imagined clip is judged, what is measured, and the steps that train its models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from envs.cater import Act, Clip, Thing
+from experiments.cater import STUDY, Args, Sizes
+from experiments.report.results import Results
+from experiments.study.cater import CaterScene, cater_scenes, judge
+from experiments.study.frame_metrics import Measures
+from experiments.study.run import run
+from experiments.train_cater import Args as TrainArgs
+from experiments.train_cater import main, steps, wanted
+from textocvp.protocols import LoadCheckpoint
+
+CONE = Thing("cone", "large", "metal", "red", (-1.5, 1.0), 0.0)
+BALL = Thing("sphere", "small", "rubber", "blue", (1.5, 1.0), 0.0)
+CUBE = Thing("cube", "medium", "rubber", "green", (0.5, -1.5), 0.0)
+
+
+def shown(acts: tuple[Act, ...], things=(CONE, BALL, CUBE)) -> tuple[Clip, np.ndarray]:
+    """A clip, and the labels (T, H, W) that the simulator draws of it."""
+
+    class Own(CaterScene):
+        def clip(self) -> Clip:
+            return Clip(things, acts)
+
+    return Clip(things, acts), Own("val", cater_scenes(1, 0, "val")[0].seed).watch(64)[1].astype(int)
+
+
+ACTS = {
+    "contain": (Act(0, "contain", 0, 25, BALL.place, 1), Act(2, "slide", 0, 25, (2.0, -2.5))),
+    "slide": (Act(0, "slide", 0, 25, (-1.5, -1.5)), Act(1, "pick-place", 0, 25, (2.5, -2.5))),
+    "rotate": (Act(1, "pick-place", 0, 25, (-0.5, 2.5)), Act(2, "rotate", 0, 25)),
+}
+
+
+@pytest.mark.parametrize("name", ACTS)
+def test_what_really_happens_is_right(name) -> None:
+    clip, labels = shown(ACTS[name])
+    for act, one in zip(clip.acts, judge(labels, clip, labels[0]), strict=True):
+        assert (one.action, one.did) == (act.action, True)
+        assert one.object is (None if act.to is None else True)
+        assert one.place is (None if act.to is None else True)
+        assert one.hidden is (None if act.into is None else True)
+
+
+def test_what_else_happens_is_wrong() -> None:
+    asked, labels = shown(ACTS["slide"])
+    _, did = shown((Act(0, "pick-place", 0, 25, (-1.5, -1.5)), Act(2, "slide", 0, 25, (-2.5, -2.5))))
+    cone, ball = judge(did, asked, did[0])
+    assert (cone.object, cone.did, cone.place) == (True, False, True)  # it was lifted
+    assert (ball.object, ball.did, ball.place) == (False, False, False)  # it stayed
+    still = np.repeat(labels[:1], len(labels), 0)
+    assert all(one.object is False and not one.did for one in judge(still, asked, labels[0]))
+    gone = labels.copy()
+    gone[1:][gone[1:] == 1] = 0  # a slot that vanishes has not gone anywhere
+    assert judge(gone, asked, labels[0])[0].object is False
+
+
+def test_slots_may_have_any_numbers_and_of_two_alike_either_may_act() -> None:
+    clip, labels = shown(ACTS["slide"])
+    numbers = np.array([5, 9, 0, 3])
+    assert [vars(one) for one in judge(numbers[labels], clip, labels[0])] == [
+        vars(one) for one in judge(labels, clip, labels[0])
+    ]
+    twin = replace(CONE, place=(1.5, -2.0))
+    things = (CONE, BALL, twin)
+    asked = Clip(things, (Act(0, "slide", 0, 25, (-1.5, -1.5)), Act(1, "rotate", 0, 25)))
+    _, other = shown((Act(2, "slide", 0, 25, (-1.5, -1.5)), Act(1, "rotate", 0, 25)), things)
+    found = judge(other, asked, other[0])[0]
+    assert (found.object, found.did, found.place) == (True, True, True)
+
+
+def test_a_scene_under_other_captions_has_the_same_things() -> None:
+    (scene,) = cater_scenes(1, 3)
+    others = [replace(scene, variant=k) for k in range(4)]
+    assert len({one.clip().instruction for one in others}) == 4
+    assert all(one.clip().things == scene.clip().things for one in others)
+    firsts = [one.watch(64)[0][0] for one in others]
+    assert all(np.array_equal(first, firsts[0]) for first in firsts)
+
+
+def test_the_study_measures_what_it_promises(tmp_path) -> None:
+    load = LoadCheckpoint("cater")
+    results = run(
+        STUDY,
+        Args(out=tmp_path, workers=1),
+        load=load,
+        sizes=Sizes(scenes=2, variants=1, clips=1),
+        loads={},
+        measures=Measures(),
+    )
+    assert isinstance(results, Results)
+    head = results.headline
+    assert {
+        "ssim_9",
+        "ssim_19",
+        "ssim_9_copy",
+        "iou_9",
+        "control_object",
+        "control_action",
+        "control_place",
+    } <= set(head)
+    truth = {
+        row.metric: row.value
+        for row in results.rows
+        if row.method == "true frames" and row.variant == "control"
+    }
+    assert head["control_object_copy"] == 0.0 and truth["object"] >= 0.5
+    assert (tmp_path / "report.html").stat().st_size > 10_000
+    assert '"variant": 0' in (tmp_path / "scenes.json").read_text()
+
+
+def test_training_is_commands_in_an_order_in_which_they_can_run(tmp_path, capsys) -> None:
+    args = TrainArgs(out=tmp_path, scale="toy")
+    found = steps(args)
+    seen: set[str] = set()
+    for step in found:
+        assert set(step.needs) <= seen
+        seen.add(step.name)
+    assert [one.name for one in wanted(found, ["predictor"])] == [
+        "train",
+        "val",
+        "votes-masks",
+        "draw",
+        "slots",
+        "predictor",
+    ]
+    with pytest.raises(ValueError, match="there is no step 'nothing'"):
+        wanted(found, ["nothing"])
+    assert main(replace(args, list=True, only=("val",))) == 0
+    listed = capsys.readouterr().out
+    assert "--world cater --split val" in listed and "train parser" not in listed
+    assert not (tmp_path / "val.h5").exists()
+    assert main(replace(args, only=("val",), collector="/bin/false")) == 1  # a step that fails is told
+    assert "val failed" in capsys.readouterr().out
