@@ -46,9 +46,9 @@ def test_the_files_hold_no_pickle(folder: Path) -> None:
 
 SHA256 = {
     "cliport": "80f54754298e836cf9b42d817e7468ca3e2f4dda0b01ba64a80cfeccb11517e5",
-    "mage-small": "2b07776f954026e6f0cb92fa9ecf2165e355bf89907f2eb3c5afadc1a4cab8ad",
-    "non-oc-small": "055d230cd31d9e0a8cea7bb5df71d21f7d3447667cfabf9ab2e94b24bd1c57ef",
-    "ocvp-seq-small": "fbdf969c2da3cbc0d54abec85040dc2ca983c4e9e5de51f7bcb88dcd89d5d3c1",
+    "mage-small": "aa57385cef278bc051bc5c3e0479486c2c8a275d557bf476d57cc3a6c6a9c6dd",
+    "non-oc-small": "4e1d6426c7f11faff46fa73a73627c6b60b60b458ebd1db6148a0db75fbf2d6d",
+    "ocvp-seq-small": "72eb0b316789da74aedbbda90da195278c29b5e43457f3d7c59aecf8d28bcab8",
     "tabletop-small": "18aa70b4474cf023d12c1d6fb4b7c12ae4100453bca3d004371439c02006dc6f",
     "tabletop-small-40": "c661b48b9daa638025ec59c7fb89e1e30e17867b01195002336abe349b5d9961",
 }
