@@ -140,8 +140,12 @@ class SlotPredictor(nn.Module):
         """What `_transform` needs of the text and of the slots that a rollout starts from."""
         return None
 
-    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor) -> Tensor:
-        """What there is to learn of words beside the prediction, a scalar; 0 by default."""
+    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor, known_BK: Tensor) -> Tensor:
+        """What there is to learn of words beside the prediction, a scalar; 0 by default.
+
+        Args:
+            acting_BK, known_BK: which slots act, and of which that is known.
+        """
         return slots_BKD.new_zeros(())
 
     def _tokens_per_frame(self, slots: int) -> int:

@@ -66,13 +66,12 @@ class TextOCVPPredictor(SlotPredictor):
     def learns_words(self) -> bool:
         return self.appearance is not None
 
-    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor) -> Tensor:
+    def words_loss(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor, known_BK: Tensor) -> Tensor:
         """What the matching of words with slots gets wrong about which slots act; 0 without such a matching."""
         if self.appearance is None:
             return slots_BKD.new_zeros(())
         shares_BKL, acts_BL = self._matched(text, slots_BKD, None)
-        used_BK = SlotState.split(slots_BKD, self.layout).is_thing[..., 0]
-        return acting_loss(shares_BKL, acts_BL, acting_BK, used_BK)
+        return acting_loss(shares_BKL, acts_BL, acting_BK, known_BK)
 
     def _matched(
         self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor | None
@@ -80,7 +79,8 @@ class TextOCVPPredictor(SlotPredictor):
         assert self.appearance is not None
         state = SlotState.split(slots_BKD, self.layout)
         content_BKC = (state.content - self.content_mean_C) / self.content_std_C
-        return self.appearance(content_BKC, state, text.embeddings_BLC, text.mask_BL, acting_BK)
+        words_BLC = text.embeddings_BLC if text.words_BLC is None else text.words_BLC
+        return self.appearance(content_BKC, state, words_BLC, text.mask_BL, acting_BK)
 
     def _text_context(
         self, text: TextTokens, slots_BTKD: Tensor, acting_BK: Tensor | None = None

@@ -41,6 +41,7 @@ class TextTokens:
     mask_BL: Tensor
     colors_BL3: Tensor  # RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere)
     names_color_BL: Tensor  # True where `colors_BL3` means something
+    words_BLC: Tensor | None = None  # each word without the others, from encoders that have such embeddings
 
     def __len__(self) -> int:
         return self.mask_BL.shape[0]

@@ -229,9 +229,10 @@ class WordEncoder(TextEncoder):
         x_BLC = self.embedding(words.ids_BL)
         if self.color_projection is not None:
             x_BLC = x_BLC + self.color_projection(words.colors_BL3) * words.names_color_BL[..., None]
+        words_BLC = x_BLC
         x_BLC = x_BLC + self.positions_LC[:length]
         bias_BL = torch.zeros_like(mask_BL, dtype=x_BLC.dtype).masked_fill(~mask_BL, -math.inf)
         for block in self.blocks:
             x_BLC = block(x_BLC, bias_BL[:, None, None])
         x_BLC = self.norm(x_BLC) * mask_BL[..., None]
-        return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL)
+        return TextTokens(x_BLC, mask_BL, words.colors_BL3, words.names_color_BL, words_BLC)

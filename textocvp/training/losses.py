@@ -13,9 +13,9 @@ from torch import Tensor
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.slots import SlotLayout, SlotState, moments
 
-ACTS = 0.09  # it acts when it gets further than this from its place, -1..1: three pixels of 64,
-TURNS = 0.12  # or when its content changes by so many of its deviations, in the mean square
+ACTS = 0.1  # it acts when it gets further than this from its place, -1..1: three pixels of 64,
 REACHED = 0.07  # or when one that moves comes to rest so near to it
+TURNS = 0.1  # it may have turned when its content changes by so many of its deviations, in the mean square
 MOVES = 0.015  # a slot moves when its centre shifts by more than this in a frame, -1..1: half a pixel of 64
 UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadratic below, linear above
 
@@ -165,18 +165,19 @@ def moving_weights(slots_BTKD: Tensor, layout: SlotLayout, moving: float, *, eve
     return present_BTK * (1.0 + (moving - 1.0) * moves_BTK)
 
 
-def acting(slots_BTKD: Tensor, layout: SlotLayout, content_std_C: Tensor) -> Tensor:
-    """Which slots act in their frames (B, K) bool: that move or turn, or that one that moves is put onto."""
+def acting(slots_BTKD: Tensor, layout: SlotLayout, content_std_C: Tensor) -> tuple[Tensor, Tensor]:
+    """Which slots act in their frames (B, K) bool: that move, or that one that moves is put onto; and who may act.
+
+    The second also has those that look otherwise at the end: they may have turned, or something else stands before
+    them.
+    """
     state = SlotState.split(slots_BTKD, layout)
-    far_BK = (state.position - state.position[:, :1]).norm(dim=-1).amax(1)
-    moves_BK = (far_BK > ACTS) & state.is_thing[:, 0, :, 0]
-    turned_BTK = (
-        ((state.content - state.content[:, :1]) / content_std_C.to(slots_BTKD.device)).square().mean(-1)
-    )
-    turns_BK = (turned_BTK[:, -1] > TURNS) & state.is_thing[:, 0, :, 0]
+    things_BK = state.is_thing[:, 0, :, 0]
+    moves_BK = ((state.position - state.position[:, :1]).norm(dim=-1).amax(1) > ACTS) & things_BK
     ends_BKK = torch.cdist(state.position[:, 0], state.position[:, -1])  # from each slot to where each ends
-    reached_BK = ((ends_BKK < REACHED) & moves_BK[:, None]).any(2) & state.is_thing[:, 0, :, 0]
-    return moves_BK | turns_BK | reached_BK
+    acting_BK = moves_BK | ((ends_BKK < REACHED) & moves_BK[:, None]).any(2) & things_BK
+    turned_BKC = (state.content[:, -1] - state.content[:, 0]) / content_std_C.to(slots_BTKD.device)
+    return acting_BK, acting_BK | (turned_BKC.square().mean(-1) > TURNS) & things_BK
 
 
 def drawn_loss(

@@ -83,6 +83,9 @@ class PredictorTraining(TrainingSettings):
     """Weight of the error in size."""
     content_weight: float = 0.3
     """Weight of the error in content."""
+    words_first: int = 0
+    """Updates, the first ones, that learn only which slots act by the words: they are quick, and what slots then do
+    is learned sooner."""
     words_weight: float = 1.0
     """Weight of what the words say of which slots act, where they are matched with what slots look like."""
     image_weight: float = 0.0
@@ -101,19 +104,27 @@ class PredictorStage(nn.Module):
             self.text.requires_grad_(False)
 
     def forward(
-        self, given_BTKD: Tensor, words: WordBatch, imagined: int, acting_BK: Tensor | None = None
+        self,
+        given_BTKD: Tensor,
+        words: WordBatch,
+        imagined: int,
+        acts: tuple[Tensor, Tensor] | None = None,
+        only_words: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Predictions (B, S, K, D), the last of which is of frame number T + imagined (the first is number 0).
 
         The `causal` form predicts from every given and every imagined frame the next, S = T + imagined. The `window`
         form only predicts new frames, S = imagined + 1. With them comes what the words get wrong about which slots act,
-        if that is told.
+        if that is told: `acts`, see `acting`. With `only_words` nothing is predicted.
         """
         text = self.text.encode(words)
-        told = {} if acting_BK is None else {"acting_BK": acting_BK}
+        told = {} if acts is None else {"acting_BK": acts[1]}
         words_loss = given_BTKD.new_zeros(())
-        if acting_BK is not None:
-            words_loss = self.predictor.words_loss(text, given_BTKD[:, 0], acting_BK)
+        if acts is not None:
+            known_BK = (acts[0] | ~acts[1]) & self.predictor.layout.used(given_BTKD[:, 0])
+            words_loss = self.predictor.words_loss(text, given_BTKD[:, 0], acts[0], known_BK)
+        if only_words:
+            return given_BTKD[:, :0], words_loss
         if not self.predictor.config.causal:
             return self.predictor.rollout(given_BTKD, text, imagined + 1, **told).slots_BSKD, words_loss
         if imagined:
@@ -155,7 +166,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
         CacheError: if `out` holds slots of another parser or of other episodes.
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
-    accelerator = open_run(args.out, args.precision)
+    accelerator = open_run(args.out, args.precision, some_unused=args.words_first > 0)
     torch.manual_seed(args.seed)
     trained = TextOCVP.from_pretrained(str(args.parser))
     with open_data(args, trained.config.parser.image_size, "parser.image_size") as (episodes, held_out):
@@ -204,17 +215,19 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
             true_BTKD = batch.slots_BTKD[:, first - 1 : last + 1]
             weights_BSK = moving_weights(true_BTKD, layout, args.moving, ever=imagined > 0)
             weights_BSK = weights_BSK / weights_BSK.sum().clamp(min=1e-6)
-            acting_BK = (
-                acting(batch.slots_BTKD, layout, batches.content_std_C) if predictor.learns_words else None
-            )
+            only_words = predictor.learns_words and step < args.words_first
+            acts = acting(batch.slots_BTKD, layout, batches.content_std_C) if predictor.learns_words else None
 
             for rows in run.micro_batches(of_batch=True):
                 slots_BTKD, target_BSKD, weights = (
                     whole[rows].to(run.device) for whole in (given_BTKD, true_BTKD[:, 1:], weights_BSK)
                 )
                 words = batch.words.select(rows).to(run.device)
-                told = None if acting_BK is None else acting_BK[rows].to(run.device)
-                predicted_BSKD, words_loss = run.module(slots_BTKD, words, imagined, told)
+                told = None if acts is None else (acts[0][rows].to(run.device), acts[1][rows].to(run.device))
+                predicted_BSKD, words_loss = run.module(slots_BTKD, words, imagined, told, only_words)
+                if only_words:
+                    run.backward(run.weight(rows) * words_loss, {"words": words_loss})
+                    continue
                 predicted_BSKD = predicted_BSKD.float()
                 loss = slot_loss(predicted_BSKD, target_BSKD, weights, layout, std_C)
                 words_loss = run.weight(rows) * words_loss
