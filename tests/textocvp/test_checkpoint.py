@@ -78,7 +78,7 @@ def test_bundled_words_are_the_tensors_rows_and_untrained_ones_are_warned_about(
         same = {
             word
             for word, row in zip(text.config.vocabulary, range(len(SPECIAL), len(rows)), strict=True)
-            if torch.allclose(rows[row], other[row], atol=1e-4)
+            if torch.allclose(rows[row], other[row], atol=2e-3)  # one of them is stored in half precision
         }
         assert same == set(text.config.untrained)
 
