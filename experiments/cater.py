@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -119,9 +120,9 @@ class CaterUnit:
             judged: list[Judged] = []
             for asked, seen in shown.items():
                 judged += judge(hold_last(seen.labels, T), asked, truth.segmentation[0])  # type: ignore[index]
-            found = {
+            found: dict[str, list[bool | None]] = {
                 "object": [one.object for one in judged],
-                "action": [one.did for one in judged],
+                "action": list(map(attrgetter("did"), judged)),
                 "place": [one.place for one in judged],
                 "vanishes": [one.hidden for one in judged],
             }

@@ -149,14 +149,16 @@ class Subject:
 
     def _slots(self, what: Timing, images_BHW3: np.ndarray, texts: list[str]) -> Mapping[Phase, Work]:
         assert isinstance(self.model, WorldModel)
-        world_model, model, options = self.model, self.model.model, {"use_cache": self.cached}
+        world_model, model, cached = self.model, self.model.model, self.cached
         parsed = world_model.parse(images_BHW3[:, None])
         slots = parsed.slots
         # Slots of the observation will do: what slots hold does not change what drawing them costs.
         seen = replace(parsed, slots=parsed.slots.expand(-1, what.frames, -1, -1))
         return {
             "encode": lambda: world_model.parse(images_BHW3[:, None]),
-            "predict": lambda: model.predictor.rollout(slots, model.text(texts), what.frames, **options),
+            "predict": lambda: model.predictor.rollout(
+                slots, model.text(texts), what.frames, use_cache=cached
+            ),
             # A selection of it each time: what a rollout has drawn it does not draw again.
             "decode": lambda: seen.select(slice(None)).frames,
         }

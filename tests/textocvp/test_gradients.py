@@ -31,7 +31,7 @@ def test_drawn_frames_teach_the_predictor_alone(config: ModelConfig) -> None:
     frames_B1[:, :, :, 8:16, 8:16] = torch.tensor([0.9, -0.9, -0.9])[:, None, None]
     slots_B1KD = model.parser(frames_B1).slots_BTKD
     words = model.text.lookup(texts)
-    predicted_BSKD = PredictorStage(model)(slots_B1KD, words, 2)
+    predicted_BSKD, _ = PredictorStage(model)(slots_B1KD, words, 2)
     drawn = model.renderer(predicted_BSKD[:, -1]).frames_B3HW
     (drawn - frames_B1[:, 0].flip(-1)).square().mean().backward()
 

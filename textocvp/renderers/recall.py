@@ -42,8 +42,9 @@ class RecallRenderer(GlimpseRenderer):
 
     def __init__(self, config: PictureConfig, layout: SlotLayout, image_size: int) -> None:
         super().__init__(config, layout, image_size)
-        self.front = nn.Sequential(nn.Linear(layout.content + 4, 64), nn.ReLU(), nn.Linear(64, 1))
-        nn.init.zeros_(self.front[-1].weight)
+        order = nn.Linear(64, 1)
+        nn.init.zeros_(order.weight)
+        self.front = nn.Sequential(nn.Linear(layout.content + 4, 64), nn.ReLU(), order)
 
     def forward(self, slots: Tensor, seen: Seen | None = None) -> Rendered:
         """Draw one frame for each set of slots (B, K, D): of any sequences, or of the one that began as `seen`."""

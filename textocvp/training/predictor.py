@@ -118,7 +118,7 @@ class PredictorStage(nn.Module):
         if that is told: `acts`, see `acting`. With `only_words` nothing is predicted.
         """
         text = self.text.encode(words)
-        told = {} if acts is None else {"acting_BK": acts[1]}
+        told = None if acts is None else acts[1]
         words_loss = given_BTKD.new_zeros(())
         if acts is not None:
             known_BK = (acts[0] | ~acts[1]) & self.predictor.layout.used(given_BTKD[:, 0])
@@ -126,14 +126,16 @@ class PredictorStage(nn.Module):
         if only_words:
             return given_BTKD[:, :0], words_loss
         if not self.predictor.config.causal:
-            return self.predictor.rollout(given_BTKD, text, imagined + 1, **told).slots_BSKD, words_loss
+            return self.predictor.rollout(
+                given_BTKD, text, imagined + 1, acting_BK=told
+            ).slots_BSKD, words_loss
         if imagined:
             with torch.no_grad():
-                imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined, **told).slots_BSKD
+                imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined, acting_BK=told).slots_BSKD
             # Under autocast some versions of torch would reuse weights that were cast without a gradient.
             torch.clear_autocast_cache()
             given_BTKD = torch.cat([given_BTKD, imagined_BSKD], dim=1)
-        return self.predictor(given_BTKD, text, **told), words_loss
+        return self.predictor(given_BTKD, text, told), words_loss
 
 
 def schedule(
