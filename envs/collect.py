@@ -82,6 +82,8 @@ class Args:
     """Factors of the scene to leave out."""
     captions: Captions = "explicit"
     """Of CATER-hard: with every attribute and the cell, or with some attributes and the quadrant."""
+    fresh: bool = False
+    """Throw away the episodes that the file has, and begin anew."""
     preview: bool = False
     """Write a contact sheet PNG of the first episodes instead."""
 
@@ -113,7 +115,7 @@ def main(args: Args) -> None:
     else:
         name = args.world if args.policy == "expert" else "sentences"
         out = args.out or Path(f"data/{name}-{args.split}.h5")
-        collect(config, args.episodes, out, args.workers, args.backend)
+        collect(config, args.episodes, out, args.workers, args.backend, fresh=args.fresh)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
 
 

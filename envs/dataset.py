@@ -474,6 +474,13 @@ def episode_count(path: Path, config: World) -> int:
     raise ValueError(f"{path} {problem}; choose another --out")
 
 
+def _has_all_columns(path: Path, config: World) -> bool:
+    """Whether a piece has what is written today; an older version may have left one."""
+    with h5py.File(path, "r") as file:
+        names = [*config.arrays, *(f"episode/{name}" for name in config.columns)]
+        return all(name in file for name in names)
+
+
 def _create(file: h5py.File, config: World) -> None:
     """Make all datasets, empty, and all attributes."""
     split = SPLITS[config.split]
@@ -523,20 +530,43 @@ Backend = Literal["processes", "dask", "ray"]
 
 
 def collect(
-    config: World, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes"
+    config: World,
+    episodes: int,
+    out: Path,
+    workers: int = 1,
+    backend: Backend = "processes",
+    *,
+    fresh: bool = False,
 ) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 
     Finished pieces wait in ``out``.parts until they are merged into ``out``, in order. Both steps are atomic,
     so a kill loses no finished piece and doubles none. With "dask" or "ray" a cluster makes the pieces (docs/scale.md);
-    all its machines see the folder of ``out`` under the same path.
+    all its machines see the folder of ``out`` under the same path. With ``fresh`` the episodes that are there are
+    thrown away first, whatever they were collected with.
 
     Raises:
         ValueError: when ``out`` exists and is something else, or was collected with another configuration; or when
             the backend is not installed.
     """
     with _only_collector(out), _joblib_backend(backend, workers):
+        if fresh:
+            _throw_away(out)
         _collect(config, episodes, out.absolute(), workers, backend)
+
+
+def _throw_away(out: Path) -> None:
+    """Delete an episode file and its pieces; a ValueError if it is something else."""
+    if out.exists():
+        try:
+            with h5py.File(out, "r") as file:
+                kind = file.attrs.get("format")
+        except OSError:
+            kind = None
+        if kind != FORMAT:
+            raise ValueError(f"{out} is no episode file, and is not thrown away: choose another --out")
+    out.unlink(missing_ok=True)
+    shutil.rmtree(out.with_name(out.name + ".parts"), ignore_errors=True)
 
 
 @contextmanager
@@ -631,7 +661,7 @@ def _end_with(parent: int) -> None:
 def _collect_piece(config: World, start: int, stop: int, piece: Path, collector: int | None) -> None:
     if collector is not None:
         _end_with(collector)
-    if episode_count(piece, config) == stop - start:
+    if episode_count(piece, config) == stop - start and _has_all_columns(piece, config):
         return
     env = _environment(config, threading.get_ident())
     episodes = list(config.record(env, range(start, stop)))

@@ -428,3 +428,32 @@ def test_two_collectors_of_one_file_do_not_meet(tmp_path: Path) -> None:
     assert dataset.episode_count(out, config) == 1 and [path.name for path in tmp_path.iterdir()] == [
         "one.h5"
     ]
+
+
+def test_fresh_throws_the_episodes_away_and_nothing_else(tmp_path: Path) -> None:
+    path, other = tmp_path / "a.h5", tmp_path / "notes.txt"
+    collect(EpisodeConfig("val"), 2, path)
+    with pytest.raises(ValueError, match="choose another --out"):
+        collect(EpisodeConfig("test"), 1, path)
+    collect(EpisodeConfig("test"), 1, path, fresh=True)
+    with h5py.File(path) as file:
+        assert file.attrs["split"] == "test" and len(file["episode/length"]) == 1
+    other.write_text("mine")
+    with pytest.raises(ValueError, match="is not thrown away"):
+        collect(EpisodeConfig("test"), 1, other, fresh=True)
+    assert other.read_text() == "mine"
+
+
+def test_a_piece_that_lacks_a_column_is_collected_again(tmp_path: Path) -> None:
+    config, whole, path = EpisodeConfig("val"), tmp_path / "whole.h5", tmp_path / "a.h5"
+    collect(config, 2, whole)
+    parts = tmp_path / "a.h5.parts"
+    parts.mkdir()
+    piece = parts / "0000000-0000002.h5"
+    piece.write_bytes(whole.read_bytes())
+    with h5py.File(piece, "r+") as file:  # as an older version wrote it
+        del file["episode/options"]
+    collect(config, 2, path)
+    with h5py.File(whole) as one, h5py.File(path) as two:
+        assert np.array_equal(one["episode/options"][:], two["episode/options"][:])
+        assert np.array_equal(one["frames"][:], two["frames"][:])

@@ -6,6 +6,7 @@ its dependencies is needed. Minari's own library writes and reads its sets, with
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
@@ -50,6 +51,7 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             written then.
     """
     rows: dict[str, list[Any]] = {}
+    content = hashlib.sha256()
     total, robot, names = 0, None, ("frames", "segmentation", "action", "reward", "state")
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as new, h5py.File(new, "w") as file:
@@ -87,9 +89,13 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             for name, of_all in rows.items():
                 of_all.append(columns[name])
             total += columns["length"]
+            content.update(episode.frames.tobytes())
         if not rows:
             raise OwnVideosError("there is no episode")
-        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSIONS[-1]})
+        config = json.dumps(
+            {"frames": content.hexdigest()}
+        )  # by which caches know that a frame was corrected
+        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSIONS[-1], "config": config})
         if robot is not None and "segmentation" in file:
             file.attrs["labels"] = json.dumps({"background": 0, "robot": robot})
         for name, of_all in rows.items():

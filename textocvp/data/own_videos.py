@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import re
 import subprocess
@@ -116,7 +117,7 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
         frames = file.create_dataset(
             "frames", shape, "u1", maxshape=(None, *shape[1:]), chunks=(4, *shape[1:]), compression="gzip"
         )
-        lengths: list[int] = []
+        content, lengths = hashlib.sha256(), list[int]()
         sentences: list[str] = []
         for path in tqdm(videos, desc="videos", unit="video"):
             sentence = captions.get(path.name) or captions.get(path.stem)
@@ -137,6 +138,7 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
                     "or train it with more --frames"
                 )
             done.say(path.name, said)
+            content.update(video.tobytes())
             frames.resize(len(frames) + len(video), axis=0)
             frames[-len(video) :] = video
             lengths.append(len(video))
@@ -145,7 +147,9 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
         done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
         if not lengths:
             raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
-        file.attrs.update({"format": "textocvp-episodes", "format_version": 2})
+        # By which caches of slots know that a later frame was corrected.
+        config = json.dumps({"frames": content.hexdigest()})
+        file.attrs.update({"format": "textocvp-episodes", "format_version": 2, "config": config})
         file["episode/start"] = np.cumsum(lengths) - lengths
         file["episode/length"] = np.array(lengths)
         file["episode/instruction"] = sentences

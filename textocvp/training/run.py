@@ -10,6 +10,8 @@ micro-batch or in many, stopped and continued or not.
 from __future__ import annotations
 
 import atexit
+import errno
+import fcntl
 import json
 import os
 import shutil
@@ -21,7 +23,7 @@ from dataclasses import asdict, dataclass
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TextIO, TypeVar
 
 import numpy as np
 import torch
@@ -43,6 +45,8 @@ from textocvp.files import replace_text
 
 STEP_FILE = "step.json"
 SETTINGS_FILE = "settings.json"
+LOCK_FILE = ".lock"
+RUN_FILES = ("state", "logs", "samples", "checkpoint", SETTINGS_FILE)  # of a run, without its caches
 LOG_EVERY = 20  # updates
 # The least that settings of any stage may be; checked before anything is written.
 LEAST = {
@@ -124,6 +128,8 @@ class TrainingSettings(RunPaths):
     """Held-out episodes they are measured on; the final figures use all."""
     save_minutes: float = 4.0
     """Minutes between saved states."""
+    fresh: bool = False
+    """Throw away the run that `out` holds, finished or not, and begin anew."""
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -179,15 +185,22 @@ M = TypeVar("M", bound=Metrics)
 
 
 def open_run(
-    out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: bool = False
+    out: Path,
+    precision: Literal["no", "bf16", "fp16"],
+    *,
+    fresh: bool = False,
+    some_unused: bool = False,
 ) -> Accelerator:
     """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
 
+    Until `close_run`, or until the process ends however that may be, no other process can open a run there.
+
     Args:
+        fresh: throw away what an earlier run left in `out`; caches of what is frozen stay.
         some_unused: some parameters of what is trained take no part in an update.
 
     Raises:
-        SettingsError: if the machine has no GPU for `fp16`.
+        SettingsError: if the machine has no GPU for `fp16`, or another process trains in `out`.
     """
     if precision == "fp16" and not torch.cuda.is_available():
         raise SettingsError("precision fp16 needs a GPU, and there is none here: use bf16 or no")
@@ -209,8 +222,32 @@ def open_run(
     )
     if accelerator.num_processes > 1:
         atexit.register(_destroy_group)
+    if accelerator.is_main_process:
+        _lock(out)
+        for name in RUN_FILES if fresh else ():
+            path = out / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        (out / "logs").mkdir(exist_ok=True)
+    accelerator.wait_for_everyone()
     accelerator.init_trackers("training")
     return accelerator
+
+
+_locks: dict[Path, TextIO] = {}  # open files, whose locks end with the process
+
+
+def _lock(out: Path) -> None:
+    lock = open(out / LOCK_FILE, "a")  # noqa: SIM115 - it stays open
+    try:
+        fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        if error.errno not in (errno.EACCES, errno.EAGAIN):
+            return  # a file system without locks
+        raise SettingsError(
+            f"{out} is being trained by another process: wait, or choose another --out"
+        ) from None
+    _locks[out.absolute()] = lock
 
 
 def _destroy_group() -> None:
@@ -221,6 +258,10 @@ def _destroy_group() -> None:
 def close_run(accelerator: Accelerator) -> None:
     """Close the log when all processes are done; another run may be opened afterwards, also in another precision."""
     accelerator.wait_for_everyone()
+    out = Path(accelerator.project_dir).parent.absolute()
+    if lock := _locks.pop(out, None):
+        lock.close()
+        (out / LOCK_FILE).unlink(missing_ok=True)
     # Not `end_training`, which also ends the group of processes: the next run of a study could not use it.
     for tracker in accelerator.trackers:
         tracker.finish()
@@ -395,8 +436,8 @@ class Run:
 
 # What may change when a run goes on: where it lies, how long, how fast and how closely watched it is.
 _FREE = {
-    "out", "data", "val", "parser", "vqvae", "taught", "steps", "accumulate", "precision", "workers", "save_minutes",
-    "evaluate_every", "evaluate_episodes",
+    "out", "data", "val", "parser", "vqvae", "taught", "start", "fresh", "steps", "accumulate", "precision", "workers",
+    "save_minutes", "evaluate_every", "evaluate_episodes",
 }  # fmt: skip
 
 
@@ -410,7 +451,7 @@ def _compare_settings(args: TrainingSettings, resumed: bool) -> None:
     elif path.exists():
         before = json.loads(path.read_text())
         for name, value in now.items():
-            if before.get(name) != value:
+            if name in before and before[name] != value:  # older runs lack newer settings
                 raise SettingsError(
                     f"{args.out} holds a run with {name.replace('_', '-')} {before.get(name)!r}, not {value!r}: "
                     "give the same settings to go on with it, or another --out"

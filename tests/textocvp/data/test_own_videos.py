@@ -204,3 +204,18 @@ def test_a_contact_sheet_has_the_sentences(tmp_path: Path) -> None:
         assert all((line < 100).sum() > 300 and line[0, 0].tolist() == [255] * 3 for line in captions)
         assert (captions[0] != captions[1]).any(), "red and green"
         np.testing.assert_array_equal(sheet[18 : 18 + 128 : 2, :128:2], video(0)[0])
+
+
+def test_caches_know_that_a_later_frame_was_corrected(tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 255, (3, 32, 32, 3), np.uint8)
+    prints = []
+    for number in range(2):
+        folder = tmp_path / f"videos{number}" / "a"
+        folder.mkdir(parents=True)
+        frames[2, 5, 5] += number
+        for t, frame in enumerate(frames):
+            iio.imwrite(folder / f"{t}.png", frame)
+        (folder.parent / "captions.txt").write_text("a put the red block in the blue bowl\n")
+        import_videos(folder.parent, tmp_path / f"{number}.h5", size=32)
+        prints.append(EpisodeFile(tmp_path / f"{number}.h5").fingerprint)
+    assert prints[0] != prints[1]
