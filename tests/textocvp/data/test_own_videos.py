@@ -217,5 +217,5 @@ def test_caches_know_that_a_later_frame_was_corrected(tmp_path: Path) -> None:
             iio.imwrite(folder / f"{t}.png", frame)
         (folder.parent / "captions.txt").write_text("a put the red block in the blue bowl\n")
         import_videos(folder.parent, tmp_path / f"{number}.h5", size=32)
-        prints.append(EpisodeFile(tmp_path / f"{number}.h5").fingerprint)
+        prints.append(open_episodes(tmp_path / f"{number}.h5").fingerprint)
     assert prints[0] != prints[1]
