@@ -138,7 +138,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
     """
     # On single frames the transition takes no part, and before the first redraw nothing but the lesson.
     some_unused = args.clip == 1 or args.first_redraw > 0
-    accelerator = open_run(args.out, args.precision, fresh=args.fresh, some_unused=some_unused)
+    accelerator = open_run(args.out, args.precision, some_unused=some_unused)
     torch.manual_seed(args.seed)
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")

@@ -168,7 +168,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
         CacheError: if `out` holds slots of another parser or of other episodes.
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
-    accelerator = open_run(args.out, args.precision, fresh=args.fresh, some_unused=args.words_first > 0)
+    accelerator = open_run(args.out, args.precision, some_unused=args.words_first > 0)
     torch.manual_seed(args.seed)
     trained = TextOCVP.from_pretrained(str(args.parser))
     with open_data(args, trained.config.parser.image_size, "parser.image_size") as (episodes, held_out):

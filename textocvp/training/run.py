@@ -46,7 +46,7 @@ from textocvp.files import replace_text
 STEP_FILE = "step.json"
 SETTINGS_FILE = "settings.json"
 LOCK_FILE = ".lock"
-RUN_FILES = ("state", "logs", "samples", "checkpoint", SETTINGS_FILE)  # of a run, without its caches
+RUN_FILES = ("state", "samples", "checkpoint", SETTINGS_FILE)  # of a run, without its logs and caches
 LOG_EVERY = 20  # updates
 # The least that settings of any stage may be; checked before anything is written.
 LEAST = {
@@ -129,7 +129,7 @@ class TrainingSettings(RunPaths):
     save_minutes: float = 4.0
     """Minutes between saved states."""
     fresh: bool = False
-    """Throw away the run that `out` holds, finished or not, and begin anew."""
+    """Throw away the run that `out` holds, finished or not, and begin anew. Its caches and logs stay."""
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -188,7 +188,6 @@ def open_run(
     out: Path,
     precision: Literal["no", "bf16", "fp16"],
     *,
-    fresh: bool = False,
     some_unused: bool = False,
 ) -> Accelerator:
     """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
@@ -196,7 +195,6 @@ def open_run(
     Until `close_run`, or until the process ends however that may be, no other process can open a run there.
 
     Args:
-        fresh: throw away what an earlier run left in `out`; caches of what is frozen stay.
         some_unused: some parameters of what is trained take no part in an update.
 
     Raises:
@@ -224,11 +222,6 @@ def open_run(
         atexit.register(_destroy_group)
     if accelerator.is_main_process:
         _lock(out)
-        for name in RUN_FILES if fresh else ():
-            path = out / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        (out / "logs").mkdir(exist_ok=True)
-    accelerator.wait_for_everyone()
     accelerator.init_trackers("training")
     return accelerator
 
@@ -237,6 +230,8 @@ _locks: dict[Path, TextIO] = {}  # open files, whose locks end with the process
 
 
 def _lock(out: Path) -> None:
+    if out.absolute() in _locks:  # of a run that failed in this process; closing the file would lose the lock
+        return
     lock = open(out / LOCK_FILE, "a")  # noqa: SIM115 - it stays open
     try:
         fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -260,8 +255,8 @@ def close_run(accelerator: Accelerator) -> None:
     accelerator.wait_for_everyone()
     out = Path(accelerator.project_dir).parent.absolute()
     if lock := _locks.pop(out, None):
-        lock.close()
         (out / LOCK_FILE).unlink(missing_ok=True)
+        lock.close()
     # Not `end_training`, which also ends the group of processes: the next run of a study could not use it.
     for tracker in accelerator.trackers:
         tracker.finish()
@@ -320,6 +315,11 @@ class Run:
         self._agreement: Any = None
         if accelerator.num_processes > 1:
             self._agreement = torch.distributed.new_group(backend="gloo", timeout=SYNC_TIMEOUT)
+        if args.fresh and accelerator.is_main_process:  # all settings have been checked by now
+            for name in RUN_FILES:
+                path = args.out / name
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        accelerator.wait_for_everyone()
         self.first = load_state(accelerator, args.out)
         if accelerator.is_main_process:
             _compare_settings(args, resumed=self.first > 0)
@@ -454,7 +454,7 @@ def _compare_settings(args: TrainingSettings, resumed: bool) -> None:
             if name in before and before[name] != value:  # older runs lack newer settings
                 raise SettingsError(
                     f"{args.out} holds a run with {name.replace('_', '-')} {before.get(name)!r}, not {value!r}: "
-                    "give the same settings to go on with it, or another --out"
+                    "give the same settings to go on with it, --fresh to throw it away, or another --out"
                 )
 
 

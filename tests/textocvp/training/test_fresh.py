@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-from textocvp.training.run import LOCK_FILE, SETTINGS_FILE, SettingsError, close_run, open_run
+from textocvp.training.run import (
+    LOCK_FILE,
+    SETTINGS_FILE,
+    Run,
+    SettingsError,
+    TrainingSettings,
+    close_run,
+    open_run,
+)
 
 
 def test_fresh_throws_the_run_away_and_nothing_else(tmp_path: Path) -> None:
     for name in ("state/a", "checkpoint/b", "samples/c", "slots-train/d", "mine/e"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
-    (tmp_path / SETTINGS_FILE).write_text("{}")
-    close_run(open_run(tmp_path, "no"))
-    assert (tmp_path / "state/a").exists() and (tmp_path / SETTINGS_FILE).exists()
-    close_run(open_run(tmp_path, "no", fresh=True))
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"logs", "slots-train", "mine"}
+    args = TrainingSettings(Path("a"), Path("b"), tmp_path, fresh=True, batch=2)
+    accelerator = open_run(tmp_path, "no")
+    with pytest.raises(SettingsError, match="cannot be shared out"):
+        Run(replace(args, accumulate=3), accelerator, torch.nn.Linear(2, 2))
+    assert (tmp_path / "state/a").exists()  # nothing is thrown away for settings that cannot be
+    assert Run(args, accelerator, torch.nn.Linear(2, 2)).first == 0
+    close_run(accelerator)
+    assert {path.name for path in tmp_path.iterdir()} == {"logs", "slots-train", "mine", SETTINGS_FILE}
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:

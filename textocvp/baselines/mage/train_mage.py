@@ -110,7 +110,7 @@ def train(args: MageTraining) -> PredictionMetrics | None:
         CacheError: if `out` holds codes of another VQ-VAE or of other episodes.
         SettingsError: if the settings exclude each other, or this machine cannot do what they ask for.
     """
-    accelerator = open_run(args.out, args.precision, fresh=args.fresh)
+    accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
     vqvae = load_vqvae(args.vqvae)
     with open_data(args, vqvae.config.image_size, "vqvae.image_size") as (episodes, held_out):

@@ -85,7 +85,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
         WeightsError: if the weights of a frozen encoder are missing.
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
-    accelerator = open_run(args.out, args.precision, fresh=args.fresh)
+    accelerator = open_run(args.out, args.precision)
     torch.manual_seed(args.seed)
     with allowed_settings():
         model = VQVAE(with_settings(mage_preset(args.preset), args.set).vqvae).to(accelerator.device)
