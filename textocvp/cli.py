@@ -15,6 +15,7 @@ import torch
 import tyro
 from PIL import UnidentifiedImageError
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from rich.tree import Tree
 
@@ -540,14 +541,14 @@ def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
 
 def _models() -> None:
     # On a screen as wide as it is; in a file or a pipe one line a model.
-    console = Console(width=None if sys.stdout.isatty() else 250)
+    console = Console(width=None if sys.stdout.isatty() else 300)
     table = Table("model", "what it is", "learnable", "predictor", "state", "weights", title="Models")
     table.columns[0].no_wrap = True
     for column in table.columns[2:4]:
         column.justify, column.no_wrap = "right", True
     for one in list_models():
         counts = ("-" if count is None else f"{count:,}" for count in (one.parameters, one.predictor))
-        table.add_row(one.name, one.what, *counts, one.state, one.weights)
+        table.add_row(one.name, one.what, *counts, one.state, escape(one.weights))  # [extra] is no markup
     console.print(table)
 
 

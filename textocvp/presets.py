@@ -162,7 +162,7 @@ DESCRIPTIONS = {
     "cliport-dino": "TextOCVP-DINO at the paper's sizes (CLIPort)",
     "cliport-lite0": "TextOCVP-DINO's pipeline on the features of EfficientNet-Lite0, which pip installs",
     "cliport": "TextOCVP for CLIPort's scene: a parser that has learned to see, and sharp frames of 336x336",
-    "cater": "TextOCVP for CATER-hard: a parser that has learned to see, words matched with what things look like",
+    "cater": "TextOCVP for CATER-hard: names are matched with what slots look like",
     "ocvp-seq-small": "OCVP-Seq, no text, on the slots of tabletop-small",
     "ocvp-seq": "OCVP-Seq, no text, at its published size",
     "non-oc-small": "Non-OC, one slot for the whole scene, small",

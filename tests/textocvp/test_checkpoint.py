@@ -63,7 +63,9 @@ def test_a_bundled_checkpoint_is_read_by_its_name(name: str) -> None:
         assert json.loads((folder / "config.json").read_text())["weights_sha256"] == SHA256[name]
 
 
-@pytest.mark.parametrize("name", [name for name in bundled_checkpoints() if name != "mage-small"])
+@pytest.mark.parametrize(
+    "name", [name for name in bundled_checkpoints() if name not in ("mage-small", "cater")]
+)
 def test_bundled_words_are_the_tensors_rows_and_untrained_ones_are_warned_about(name: str) -> None:
     text = TextOCVP.from_pretrained(name).text
     rows = text.embedding.weight
@@ -82,6 +84,15 @@ def test_bundled_words_are_the_tensors_rows_and_untrained_ones_are_warned_about(
             if torch.allclose(rows[row], other[row], atol=2e-3)  # one of them is stored in half precision
         }
         assert same == set(text.config.untrained)
+
+
+def test_the_words_of_cater_are_those_of_its_captions() -> None:
+    text = TextOCVP.from_pretrained("cater").text
+    said = "the small gold metal snitch is sliding to (-2, 1). the large red rubber cone is rotating."
+    assert text.unknown_words(said) == []
+    assert text.unknown_words("the pink cone is sliding to (4, -1)") == ["pink", "4"]
+    both = text([said, said.replace("(-2, 1)", "(2, 1)")]).embeddings_BLC
+    assert (both[0] - both[1]).abs().max() > 0.1  # a number's sign is read
 
 
 def test_another_word_in_a_preset_breaks_no_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

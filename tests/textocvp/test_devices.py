@@ -46,7 +46,7 @@ def test_both_stages_stay_on_the_device(config: ModelConfig) -> None:
     slots = torch.empty(2, 4, config.parser.num_slots, layout.dim, device="meta")
     dynamics = PredictorStage(model)
     if config.predictor.causal:
-        predicted = dynamics(slots[:, :3], words, 0)
+        predicted, _ = dynamics(slots[:, :3], words, 0)
     else:  # a rollout picks the slots that are used, which needs numbers
         predicted = model.predictor(slots[:, :3], model.text.encode(words))
     true = slots[:, 3 - predicted.shape[1] :]
