@@ -169,7 +169,6 @@ METHODS: dict[str, Method] = {
         ),
         Method(
             key="savi",
-            kind="baseline",
             hue=7,
             note="published slot attention from pixels, and text",
             model="savi-cater-trained",
