@@ -38,8 +38,8 @@ def test_long_and_short_exclude_each_other() -> None:
 def test_a_model_is_named_by_its_row(bad: str) -> None:
     with pytest.raises(
         UsageError,
-        match="NAME of ours, 40 frames, ours, taught by masks, savi, OCVP-Seq, Non-OC, MAGE, TextOCVP on EfficientNet-Lite0, "
-        "slot attention on EfficientNet-Lite0; got",
+        match="NAME of ours, 40 frames, ours, taught by masks, savi, OCVP-Seq, Non-OC, MAGE, "
+        "TextOCVP on EfficientNet-Lite0, slot attention on EfficientNet-Lite0; got",
     ):
         StudyArgs(model=(bad,))
 
