@@ -38,9 +38,9 @@ class Args:
     """In all."""
     seed: int = 0
     """Of the moments."""
-    episodes: int = 120
+    episodes: int = 60
     """That the collection makes."""
-    steps: int = 12
+    steps: int = 6
     """Updates of a training, each followed by a saved state."""
 
 
