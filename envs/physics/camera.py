@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import cos, radians, sin, tan
 
 import numpy as np
@@ -58,14 +59,7 @@ class Camera:
     @property
     def extrinsics(self) -> NDArray[np.float64]:
         """(4, 4) world -> camera, in OpenCV's frame: x right, y down, z forward; metres."""
-        eye, target = np.array(self.preset.eye), np.array(self.preset.target)
-        forward = (target - eye) / np.linalg.norm(target - eye)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        right /= np.linalg.norm(right)
-        matrix = np.eye(4)
-        matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        matrix[:3, 3] = -matrix[:3, :3] @ eye
-        return matrix
+        return _extrinsics(self.preset).copy()
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixels (..., 2) as (u, v) of world points (..., 3) in metres."""
@@ -98,3 +92,15 @@ class Camera:
         """Distance along the optical axis, from OpenGL's depth buffer (0..1)."""
         near, far = self.preset.near, self.preset.far
         return (far * near / (far - (far - near) * buffer)).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _extrinsics(preset: CameraPreset) -> NDArray[np.float64]:
+    eye, target = np.array(preset.eye), np.array(preset.target)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    matrix[:3, 3] = -matrix[:3, :3] @ eye
+    return matrix
