@@ -15,8 +15,8 @@ import pytest
 from textocvp.cli import main
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeFile
-from textocvp.data.exchange import export, import_set, kind_of, write_episodes
-from textocvp.data.own_videos import OwnVideosError
+from textocvp.data.exchange import export, import_set, kind_of
+from textocvp.data.own_videos import OwnVideosError, write_episodes
 
 SENTENCES = ("put the red block in the blue bowl", "lege den grünen Block in die Schüssel")
 PRIMITIVE = {"frame": 0, "action": [0.5, float(np.float32(0.1)), 0.4, -0.2]}
@@ -171,6 +171,46 @@ def test_lerobots_older_layout_with_videos_is_read(tmp_path: Path) -> None:
     with pytest.raises(OwnVideosError, match=r"version v1\.6, and v2\.0, v2\.1 and v3\.0 are read"):
         import_set(source, tmp_path / "other.h5")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["back.h5", "old"]
+
+
+def test_lerobots_present_layout_with_two_episodes_in_one_video_is_read(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    source, lengths, fps = tmp_path / "new", (5, 7), 10
+    for name in ("meta/episodes/chunk-000", "data/chunk-000", "videos/front/chunk-000"):
+        (source / name).mkdir(parents=True)
+    frames = np.stack([np.full((32, 32, 3), 20 * t, np.uint8) for t in range(sum(lengths))])
+    video = source / "videos/front/chunk-000/file-000.mp4"
+    iio.imwrite(video, frames, plugin="FFMPEG", fps=fps)
+    data = {"episode_index": [0] * lengths[0] + [1] * lengths[1]}
+    parquet.write_table(pa.table(data), source / "data/chunk-000/file-000.parquet")
+    rows = [
+        {
+            "episode_index": number, "tasks": [SENTENCES[number]], "length": lengths[number],
+            "data/chunk_index": 0, "data/file_index": 0, "videos/front/chunk_index": 0, "videos/front/file_index": 0,
+            "videos/front/from_timestamp": sum(lengths[:number]) / fps,
+        }
+        for number in range(2)
+    ]  # fmt: skip
+    parquet.write_table(pa.Table.from_pylist(rows), source / "meta/episodes/chunk-000/file-000.parquet")
+    info = {
+        "codebase_version": "v3.0", "fps": fps, "total_episodes": 2, "chunks_size": 1000,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        "features": {"front": {"dtype": "video"}},
+    }  # fmt: skip
+    (source / "meta/info.json").write_text(json.dumps(info))
+    import_set(source, tmp_path / "back.h5")
+    with EpisodeFile(tmp_path / "back.h5") as found:
+        assert found.lengths.tolist() == list(lengths) and found.instructions == SENTENCES
+        both = np.concatenate([found.frames(0), found.frames(1)]).astype(int)
+    assert np.abs(both - frames).max() < 6, "lossy, and no frame off by one"
+    iio.imwrite(video, frames[:-1], plugin="FFMPEG", fps=fps)
+    with pytest.raises(
+        OwnVideosError, match=r"file-000\.mp4 ends before frame 12, to which its episodes reach"
+    ):
+        import_set(source, tmp_path / "other.h5")
 
 
 @pytest.mark.parametrize("to", ["lerobot", "minari"])
