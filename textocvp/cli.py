@@ -32,13 +32,12 @@ from textocvp.checkpoint import (
     write_config,
 )
 from textocvp.config import ModelConfig, with_settings
-from textocvp.drawing import SUFFIXES
 from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.parsers.efficientnet import LITE0
-from textocvp.pictures import read_picture
+from textocvp.pictures import SUFFIXES, read_picture
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
 from textocvp.pretrained import WeightsError
 from textocvp.protocols import load_model

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.drawing import save_film
 from textocvp.layers import pixel_grid
+from textocvp.pictures import save_film
 from textocvp.renderers.base import Rendered, Renderer, Seen
 from textocvp.slots import SlotLayout, SlotState
 

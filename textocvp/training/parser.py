@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 from textocvp.config import with_settings
 from textocvp.data.episodes import Episodes
-from textocvp.drawing import color_masks
 from textocvp.model import TextOCVP
 from textocvp.parsers.votes import VotesParser
+from textocvp.pictures import color_masks
 from textocvp.presets import preset
 from textocvp.slots import SlotState
 from textocvp.training.clips import ClipTraining, clip_reader, save_samples, to_pictures
