@@ -20,9 +20,11 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from textocvp.files import replacing
+
 from .cater.record import Captions, CaterConfig
 from .checks import check_range
-from .dataset import Backend, EpisodeConfig, World, atomically, collect, episode_count
+from .dataset import Backend, EpisodeConfig, World, collect, episode_count
 from .factors import FACTORS
 from .geometry import SIZES
 from .physics.camera import PRESETS
@@ -143,7 +145,8 @@ def save_contact_sheet(config: World, episodes: int, out: Path) -> None:
         rows = [_contact_row(episode.arrays["frames"]) for episode in played]
     finally:
         env.close()
-    with atomically(out, out.parent) as part:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(out) as part:
         iio.imwrite(part, np.concatenate(rows), extension=out.suffix)
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
 import shutil
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
@@ -24,6 +22,8 @@ import numpy as np
 from joblib import Parallel, delayed, parallel_config
 from numpy.typing import NDArray
 from tqdm import tqdm
+
+from textocvp.files import hdf5_to_write, replacing
 
 from .expert import Expert
 from .factors import Factors
@@ -384,10 +384,10 @@ def versions(*packages: str) -> dict[str, str | None]:
 
 def merge(path: Path, config: World, pieces: Iterable[Path], workshop: Path) -> None:
     """Append the files ``pieces`` to ``path`` (created if missing), which opens at any moment."""
-    with atomically(path, workshop) as part:
+    with replacing(path, workshop) as part:
         if exists := path.exists():
             shutil.copyfile(path, part)
-        with _hdf5(part, "r+" if exists else "w") as file:
+        with hdf5_to_write(part, "r+" if exists else "w") as file:
             if not exists:
                 _create(file, config)
             for piece in pieces:
@@ -395,56 +395,6 @@ def merge(path: Path, config: World, pieces: Iterable[Path], workshop: Path) -> 
                     names = [*config.arrays, *(f"episode/{name}" for name in config.columns)]
                     # A file that was begun before there were `options` or actions goes on without.
                     _append(file, {name: source[name][:] for name in names if name in file})
-
-
-@contextmanager
-def atomically(path: Path, folder: Path) -> Iterator[Path]:
-    """A file to write in ``folder``; it takes the name ``path`` when it is whole and on the disk, else it goes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{path.name}.{uuid.uuid4().hex}.part"  # of this machine or another
-    try:
-        yield part
-        with open(part, "rb") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)  # on a full disk nothing else makes room
-        raise
-
-
-class _Disk(io.FileIO):
-    """A file that keeps its first error to itself: HDF5 crashes when it cannot write what it closes."""
-
-    error: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        left = memoryview(data).cast("B")
-        size = len(left)
-        try:
-            while left and self.error is None:
-                left = left[super().write(left) :]
-        except OSError as error:
-            self.error = error
-        return size
-
-    def truncate(self, size: int | None = None) -> int:
-        try:
-            return super().truncate(size)
-        except OSError as error:
-            self.error = self.error or error
-            return size or 0
-
-
-@contextmanager
-def _hdf5(path: Path, mode: Literal["w", "r+"]) -> Iterator[h5py.File]:
-    """The file, open to write; an OSError, when it is closed, where there was no room for it."""
-    with _Disk(path, f"{mode[0]}+") as disk:
-        try:
-            with h5py.File(disk, mode) as file:
-                yield file
-        finally:
-            if disk.error is not None:
-                raise OSError(disk.error.errno, disk.error.strerror, str(path)) from disk.error
 
 
 def episode_count(path: Path, config: World) -> int:
@@ -670,6 +620,6 @@ def _collect_piece(config: World, start: int, stop: int, piece: Path, collector:
     }
     for name, (dtype, value) in config.columns.items():
         values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
-    with atomically(piece, piece.parent) as part, _hdf5(part, "w") as file:
+    with replacing(piece, piece.parent) as part, hdf5_to_write(part) as file:
         _create(file, config)
         _append(file, values)

@@ -32,6 +32,7 @@ from textocvp.checkpoint import (
     write_config,
 )
 from textocvp.config import ModelConfig, with_settings
+from textocvp.files import replacing
 from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
@@ -355,7 +356,8 @@ def _data(arguments: list[str]) -> int:
                 return 1 if found else 0
             print("\n".join(own_videos.describe(episodes)))
             if isinstance(action, PreviewCommand):
-                iio.imwrite(action.out, own_videos.contact_sheet(episodes))
+                with replacing(action.out) as new:
+                    iio.imwrite(new, own_videos.contact_sheet(episodes))
                 for index, text in enumerate(episodes.instructions[: own_videos.SHOWN]):
                     print(f"row {index}: {text}")
                 print(f"wrote {action.out}")

@@ -6,12 +6,11 @@ its dependencies is needed. Minari's own library writes and reads its sets, with
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
@@ -20,88 +19,24 @@ from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from textocvp.data.cater import CaterEpisodes
 from textocvp.data.cliport import CliportEpisodes
-from textocvp.data.episodes import FORMAT, FORMAT_VERSIONS, Episode, EpisodeFile, Episodes
-from textocvp.data.own_videos import Imported, OwnVideosError, to_square, video_frames
-from textocvp.files import replacing
+from textocvp.data.episodes import Episode, EpisodeFile, Episodes
+from textocvp.data.own_videos import Imported, OwnVideosError, to_square, video_frames, write_episodes
 
 Target = Literal["lerobot", "minari"]
 CAMERA = "observation.images.rgb"
 OURS = "textocvp/"  # columns of LeRobot's table of episodes that only this program reads
-ROOM = 16  # objects of an episode, at most
 FILE_BYTES = 100 << 20  # of a data file, as LeRobot's own
 MINARI_NAME = re.compile(r"[-\w.]+-v\d+")
 _INDEX = {
     "timestamp": "float32",
     **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64"),
 }
-
-
-def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
-    """Write an episode file; what the first episode has, all have. Gives the numbers of episodes and frames.
-
-    Raises:
-        OwnVideosError: if there is none, or one lacks what the first has or has it in another shape; nothing is
-            written then.
-    """
-    rows: dict[str, list[Any]] = {}
-    content = hashlib.sha256()
-    total, robot, names = 0, None, ("frames", "segmentation", "action", "reward", "state")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as new, h5py.File(new, "w") as file:
-        for number, episode in enumerate(episodes):
-            arrays = {name: v for name in names if (v := getattr(episode, name)) is not None}
-            if episode.position is not None:
-                room = ((0, 0), (0, ROOM - episode.position.shape[1]), (0, 0))
-                arrays["object_position"] = np.pad(episode.position, room, constant_values=np.nan)
-            columns: dict[str, Any] = {"length": len(episode.frames), "instruction": episode.instruction}
-            columns |= {name: v for name in ("seed", "success") if (v := getattr(episode, name)) is not None}
-            lists = {"primitives": episode.primitives} if episode.action is not None else {}
-            lists |= {name: v for name in ("objects", "questions") if (v := getattr(episode, name))}
-            columns |= {
-                n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()
-            }
-            if number == 0:
-                robot, rows = episode.robot, {name: [] for name in columns}
-                for name, values in arrays.items():
-                    shape, image = values.shape[1:], values.dtype == np.uint8
-                    file.create_dataset(
-                        name, (0, *shape), values.dtype, maxshape=(None, *shape),
-                        chunks=(4 if image else 256, *shape), compression="gzip" if image else None,
-                    )  # fmt: skip
-            if lacking := {*rows, *file} - {*columns, *arrays}:
-                raise OwnVideosError(
-                    f"episode {number} has no {min(lacking)}, and the first has: all must be alike"
-                )
-            for name in file:
-                if arrays[name].shape[1:] != file[name].shape[1:]:
-                    raise OwnVideosError(
-                        f"episode {number}: {name} of shape {arrays[name].shape[1:]}, and {file[name].shape[1:]} before"
-                    )
-                file[name].resize(total + len(arrays[name]), axis=0)
-                file[name][total:] = arrays[name]
-            for name, of_all in rows.items():
-                of_all.append(columns[name])
-            total += columns["length"]
-            content.update(episode.frames.tobytes())
-        if not rows:
-            raise OwnVideosError("there is no episode")
-        config = json.dumps(
-            {"frames": content.hexdigest()}
-        )  # by which caches know that a frame was corrected
-        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSIONS[-1], "config": config})
-        if robot is not None and "segmentation" in file:
-            file.attrs["labels"] = json.dumps({"background": 0, "robot": robot})
-        for name, of_all in rows.items():
-            file[f"episode/{name}"] = of_all
-        file["episode/start"] = np.cumsum(rows["length"]) - rows["length"]
-    return len(rows["length"]), total
 
 
 def kind_of(source: Path) -> str:

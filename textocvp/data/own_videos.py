@@ -7,11 +7,11 @@ import hashlib
 import json
 import re
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import h5py
 import imageio.v3 as iio
 import numpy as np
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from textocvp.data.episodes import Episodes, words_of
-from textocvp.files import replacing
+from textocvp.data.episodes import FORMAT, FORMAT_VERSIONS, Episode, Episodes, words_of
+from textocvp.files import hdf5_to_write, replacing
 from textocvp.pictures import bring_to_size, read_picture
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif")
@@ -29,6 +29,7 @@ CAPTIONS = ("captions.json", "captions.csv", "captions.txt")
 SHOWN, MOMENTS = 12, 6  # episodes of a contact sheet, and frames of each
 LEAST_SHOWN, STRIP = 96, 18  # pixels: height of its frames, and of the line with the sentence above them
 WINDOW = 24  # frames that a predictor looks ahead while it learns, unless it is told otherwise
+ROOM = 16  # objects of an episode, at most
 HEADER_TRUST = 0.9  # fewer frames than this share of what the header says, and two: the file was cut short
 
 
@@ -111,50 +112,109 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
     videos = [one for one in _seen(source) if one.suffix.lower() in VIDEOS or one.is_dir()]
     if not videos:
         raise OwnVideosError(f"{source} has no video ({', '.join(VIDEOS)}) and no folder of pictures")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as new, h5py.File(new, "w") as file:
-        shape = (0, size, size, 3)
-        frames = file.create_dataset(
-            "frames", shape, "u1", maxshape=(None, *shape[1:]), chunks=(4, *shape[1:]), compression="gzip"
-        )
-        content, lengths = hashlib.sha256(), list[int]()
-        sentences: list[str] = []
-        for path in tqdm(videos, desc="videos", unit="video"):
-            sentence = captions.get(path.name) or captions.get(path.stem)
-            if not sentence:
-                done.left_out.append(f"{path.name}: the captions have no sentence for it")
-                continue
-            try:
-                video, said = read_video(path, size, crop, every)
-            except Exception as error:  # decoders raise whatever they like
-                done.left_out.append(f"{path.name}: it cannot be read ({str(error).splitlines()[0][:120]})")
-                continue
-            if len(video) < 2:
-                done.left_out.append(f"{path.name}: {len(video)} frames, and an episode needs at least 2")
-                continue
-            if len(video) > WINDOW + 1:
-                said.append(
-                    f"longer than {WINDOW + 1} frames, after which the predictor stops looking: take --every, "
-                    "or train it with more --frames"
-                )
-            done.say(path.name, said)
-            content.update(video.tobytes())
-            frames.resize(len(frames) + len(video), axis=0)
-            frames[-len(video) :] = video
-            lengths.append(len(video))
-            sentences.append(sentence)
-        known = {name for path in videos for name in (path.name, path.stem)}
-        done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
-        if not lengths:
-            raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
-        # By which caches of slots know that a later frame was corrected.
-        config = json.dumps({"frames": content.hexdigest()})
-        file.attrs.update({"format": "textocvp-episodes", "format_version": 2, "config": config})
-        file["episode/start"] = np.cumsum(lengths) - lengths
-        file["episode/length"] = np.array(lengths)
-        file["episode/instruction"] = sentences
-    done.episodes, done.frames = len(lengths), sum(lengths)
+    done.episodes, done.frames = write_episodes(
+        out, _read_videos(source, videos, captions, size, crop, every, done)
+    )
     return done
+
+
+def _read_videos(
+    source: Path,
+    videos: list[Path],
+    captions: dict[str, str],
+    size: int,
+    crop: bool,
+    every: int,
+    done: Imported,
+) -> Iterator[Episode]:
+    """The videos that can be used; of the others `done` says why."""
+    used = 0
+    for path in tqdm(videos, desc="videos", unit="video"):
+        sentence = captions.get(path.name) or captions.get(path.stem)
+        if not sentence:
+            done.left_out.append(f"{path.name}: the captions have no sentence for it")
+            continue
+        try:
+            video, said = read_video(path, size, crop, every)
+        except Exception as error:  # decoders raise whatever they like
+            done.left_out.append(f"{path.name}: it cannot be read ({str(error).splitlines()[0][:120]})")
+            continue
+        if len(video) < 2:
+            done.left_out.append(f"{path.name}: {len(video)} frames, and an episode needs at least 2")
+            continue
+        if len(video) > WINDOW + 1:
+            said.append(
+                f"longer than {WINDOW + 1} frames, after which the predictor stops looking: take --every, "
+                "or train it with more --frames"
+            )
+        done.say(path.name, said)
+        used += 1
+        yield Episode(frames=video, instruction=sentence)
+    known = {name for path in videos for name in (path.name, path.stem)}
+    done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
+    if not used:
+        raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
+
+
+def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
+    """Write an episode file; what the first episode has, all have. Gives the numbers of episodes and frames.
+
+    Raises:
+        OwnVideosError: if there is none, or one lacks what the first has or has it in another shape; nothing is
+            written then.
+    """
+    rows: dict[str, list[Any]] = {}
+    content = hashlib.sha256()
+    total, robot, names = 0, None, ("frames", "segmentation", "action", "reward", "state")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(out) as new, hdf5_to_write(new) as file:
+        for number, episode in enumerate(episodes):
+            arrays = {name: v for name in names if (v := getattr(episode, name)) is not None}
+            if episode.position is not None:
+                room = ((0, 0), (0, ROOM - episode.position.shape[1]), (0, 0))
+                arrays["object_position"] = np.pad(episode.position, room, constant_values=np.nan)
+            columns: dict[str, Any] = {"length": len(episode.frames), "instruction": episode.instruction}
+            columns |= {name: v for name in ("seed", "success") if (v := getattr(episode, name)) is not None}
+            lists = {"primitives": episode.primitives} if episode.action is not None else {}
+            lists |= {name: v for name in ("objects", "questions") if (v := getattr(episode, name))}
+            columns |= {
+                n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()
+            }
+            if number == 0:
+                robot, rows = episode.robot, {name: [] for name in columns}
+                for name, values in arrays.items():
+                    shape, image = values.shape[1:], values.dtype == np.uint8
+                    file.create_dataset(
+                        name, (0, *shape), values.dtype, maxshape=(None, *shape),
+                        chunks=(4 if image else 256, *shape), compression="gzip" if image else None,
+                    )  # fmt: skip
+            if lacking := {*rows, *file} - {*columns, *arrays}:
+                raise OwnVideosError(
+                    f"episode {number} has no {min(lacking)}, and the first has: all must be alike"
+                )
+            for name in file:
+                if arrays[name].shape[1:] != file[name].shape[1:]:
+                    raise OwnVideosError(
+                        f"episode {number}: {name} of shape {arrays[name].shape[1:]}, and {file[name].shape[1:]} before"
+                    )
+                file[name].resize(total + len(arrays[name]), axis=0)
+                file[name][total:] = arrays[name]
+            for name, of_all in rows.items():
+                of_all.append(columns[name])
+            total += columns["length"]
+            content.update(episode.frames.tobytes())
+        if not rows:
+            raise OwnVideosError("there is no episode")
+        config = json.dumps(
+            {"frames": content.hexdigest()}
+        )  # by which caches know that a frame was corrected
+        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSIONS[-1], "config": config})
+        if robot is not None and "segmentation" in file:
+            file.attrs["labels"] = json.dumps({"background": 0, "robot": robot})
+        for name, of_all in rows.items():
+            file[f"episode/{name}"] = of_all
+        file["episode/start"] = np.cumsum(rows["length"]) - rows["length"]
+    return len(rows["length"]), total
 
 
 def _seen(folder: Path) -> list[Path]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from textocvp.files import replace_text
 from textocvp.rollout import Rollout
 
 SEEN = 0.5  # presence of a slot from which on it is named
@@ -123,5 +124,5 @@ def what_if_page(title: str, films: Sequence[Mapping[str, Any]]) -> str:
 def save_page(path: Path, title: str, films: Sequence[Mapping[str, Any]]) -> Path:
     """Write `what_if_page`; missing folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(what_if_page(title, films), encoding="utf-8")
+    replace_text(path, what_if_page(title, films))
     return path

@@ -64,6 +64,7 @@ LEAST = {
     "clip": 1,
     "workers": 0,
 }
+BEGINS_WITH = ("parser", "taught", "start", "vqvae")  # settings that name a checkpoint, in one stage or another
 SYNC_TIMEOUT = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
 
 
@@ -137,6 +138,13 @@ class TrainingSettings(RunPaths):
             if value is not None and not value >= least:
                 option = name.replace("_", "-")
                 raise SettingsError(f"--{option} is {value}: must be at least {least}")
+        for name in BEGINS_WITH:
+            source = getattr(self, name, None)
+            path = Path(source or "").resolve()
+            if source is not None and path.exists() and self.out.resolve() in path.parents:
+                raise SettingsError(
+                    f"--{name} {source} lies in --out {self.out}, which this run writes: choose another --out"
+                )
 
 
 @contextmanager

@@ -6,6 +6,8 @@ import csv
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -53,6 +55,59 @@ def fill(folder: Path, count: int = 4) -> Path:
     with open(folder / "captions.csv", "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows(rows)
     return folder
+
+
+FULL_DISK = """
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 12, 1 << 12))  # files may have 4 KiB, as on a full disk
+from textocvp.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("what", ["import videos", "import lerobot", "export", "preview"])
+def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, what: str) -> None:
+    if what in ("import lerobot", "export"):
+        pytest.importorskip("pyarrow")
+    videos = fill(tmp_path / "videos")
+    for name in ("0000", "0001", "0002"):  # pixels that do not pack
+        for path in (videos / name).iterdir():
+            iio.imwrite(path, np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
+    import_videos(videos, tmp_path / "made.h5")
+    out = tmp_path / {"export": "set", "preview": "old.png"}.get(what, "old.h5")
+    command = {
+        "import videos": ["import", "videos", "--out", out.name],
+        "import lerobot": ["import", "lerobot", "--out", out.name],
+        "export": ["export", "made.h5", "--to", "lerobot", "--out", out.name],
+        "preview": ["preview", "made.h5", "--out", out.name],
+    }[what]
+    if what == "import lerobot":
+        assert (
+            main(
+                [
+                    "data",
+                    "export",
+                    str(tmp_path / "made.h5"),
+                    "--to",
+                    "lerobot",
+                    "--out",
+                    str(tmp_path / "lerobot"),
+                ]
+            )
+            == 0
+        )
+    if what != "export":
+        out.write_text("old")
+    before = sorted(one.name for one in tmp_path.iterdir())
+    run = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, "data", *command], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert run.returncode == 1 and "File too large" in run.stderr and "Traceback" not in run.stderr, (
+        run.stderr
+    )
+    assert sorted(one.name for one in tmp_path.iterdir()) == before
+    assert not out.is_file() or out.read_text() == "old"
 
 
 def test_the_commands_of_the_page(tmp_path: Path, monkeypatch, capsys) -> None:

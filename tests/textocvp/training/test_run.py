@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,18 @@ def test_what_cannot_be_done_is_said(folder: Path, monkeypatch: pytest.MonkeyPat
     arguments = ["train", "parser", *files, "--out", str(folder / "half"), "--precision", "fp16"]
     assert cli.main(arguments) == 1
     assert "fp16 needs a GPU" in capsys.readouterr().err and not (folder / "half").exists()
+
+
+def test_a_run_does_not_write_over_what_it_begins_with(folder: Path) -> None:
+    train(parser_run(folder, "begun", steps=1))
+    checkpoint = folder / "begun/checkpoint"
+    before = (checkpoint / "model.safetensors").read_bytes()
+    for begin in (partial(predictor_run, parser=checkpoint), partial(parser_run, start=checkpoint)):
+        with pytest.raises(
+            SettingsError, match=r"begun/checkpoint lies in --out .*begun, which this run writes"
+        ):
+            begin(folder, "begun", fresh=True)
+    assert (checkpoint / "model.safetensors").read_bytes() == before
 
 
 def test_a_run_with_other_settings_is_not_taken_for_the_same(folder: Path) -> None:
