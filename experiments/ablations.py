@@ -26,15 +26,7 @@ from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Line, TableSpec
-from experiments.study.ablation_runs import (
-    PARSERS,
-    PREDICTORS,
-    PRESETS,
-    RUNS,
-    find_run,
-    load_run,
-    runs_table,
-)
+from experiments.study.ablation_runs import PARSERS, PREDICTORS, PRESETS, RUNS, find_run, load_run, runs_table
 from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
@@ -198,13 +190,9 @@ def units(run: Run) -> dict[str, Part]:
     unseen = study_scenes("unseen_colors", sizes.unseen, seed)
     counted = [scene for split in OBJECTS.values() for scene in study_scenes(split, sizes.slots, seed)]
     players = [("random candidate", None), ("expert", None), *(("ours", one.load) for one in predictors)]
-    following = [
-        FollowingScene(s, predictors, VARIANTS, seed, run.measures) for s in varied[: sizes.following]
-    ]
+    following = [FollowingScene(s, predictors, VARIANTS, seed, run.measures) for s in varied[: sizes.following]]
     following += [FollowingScene(s, predictors, 0, seed) for s in unseen]
-    acting = [
-        LoopEpisode(who, s, 0, VARIANTS, seed, load) for s in varied[: sizes.acted] for who, load in players
-    ]
+    acting = [LoopEpisode(who, s, 0, VARIANTS, seed, load) for s in varied[: sizes.acted] for who, load in players]
     parsed = [ParsingScene(s, parsers, seed) for s in study_scenes("test", sizes.parsing, seed)]
     few_and_many = [ParsingScene(s, counts, seed) for s in counted]
     imagined = [FollowingScene(s, counts, 0, seed) for s in counted]
@@ -221,9 +209,7 @@ def units(run: Run) -> dict[str, Part]:
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """The scenes in which most of the trained predictors reach the bowl, and those in which fewest do."""
     trained = entrants(run, "predictor")[1:]
-    shown = tuple(
-        Model(e.name, e.load, True, e.name, "", None) for e in trained if e.load and e.name in SHOWN
-    )
+    shown = tuple(Model(e.name, e.load, True, e.name, "", None) for e in trained if e.load and e.name in SHOWN)
     clips, missed = [], []
     for one in found["predictors"] if trained else ():
         if one.scene.split == "controllability":

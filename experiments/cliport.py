@@ -37,16 +37,7 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, hold_last
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
-from planning import (
-    THRESHOLDS,
-    BeamPlanner,
-    Goal,
-    Imagines,
-    Instruction,
-    LiteralController,
-    Planner,
-    RandomPlanner,
-)
+from planning import THRESHOLDS, BeamPlanner, Goal, Imagines, Instruction, LiteralController, Planner, RandomPlanner
 from textocvp.data import open_episodes
 from textocvp.data.cliport import CliportEpisodes
 
@@ -112,9 +103,7 @@ PAPERS = {
     "true frames": _paper("parser on true frames", iou=(0.554, 0.553)),
     "copy frame": _paper("Copy-Seed", iou=(0.540, 0.525)),
 }  # fmt: skip
-MEASURED = lines(
-    ("ours", TAUGHT, LITE0, "Non-OC", "MAGE", "true frames", LITE0_PARSER, "wrong text", "copy frame")
-)
+MEASURED = lines(("ours", TAUGHT, LITE0, "Non-OC", "MAGE", "true frames", LITE0_PARSER, "wrong text", "copy frame"))
 LINES: dict[str, Line] = {line.key: replace(line, paper=PAPERS.get(line.key)) for line in MEASURED}
 LINES["SEER"] = Line(key="SEER", kind="baseline", note="not run", paper=PAPERS["SEER"])
 
@@ -352,9 +341,7 @@ def headline(run: Run) -> dict[str, Key]:
             named[f"{metric}_{n}{ending}"] = (method, ALL, variant, metric)
         named[f"success_original{ending}"] = (method, ALL, "original", "success")
         named[f"success_variants{ending}"] = (method, ALL, "other bowls", "success")
-    for split, (method, ending) in product(
-        OWN_SPLITS, {"ours": "", "no imagination": "_no_imagination"}.items()
-    ):
+    for split, (method, ending) in product(OWN_SPLITS, {"ours": "", "no imagination": "_no_imagination"}.items()):
         named[f"closed_loop_{split}{ending}"] = (method, split, "original", "closed_loop_success")
     return named
 

@@ -100,9 +100,7 @@ class Args(StudyArgs):
             self.checkpoint = "cliport"
         for name in self.retrained:
             if not (Path(name) / WEIGHTS_FILE).is_file():
-                raise UsageError(
-                    f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}"
-                )
+                raise UsageError(f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}")
 
     @property
     def others(self) -> dict[str, LoadCheckpoint]:
@@ -225,9 +223,7 @@ class ConsequenceClip:
         if episode.scene.look == "simple":  # in others the arm takes longer
             horizon = min(HORIZON, horizon)
         if said_at_once := isinstance(goal, Goal):
-            first = to_uint8(
-                model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon).frames[0]
-            )
+            first = to_uint8(model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon).frames[0])
         else:
             first = goal.rgb[None]
         result = episode.pursue(worker, env, goal)
@@ -274,9 +270,7 @@ def units(run: Run) -> dict[str, Part]:
         scenes = [family_scene(family, first + i, *ground) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
         keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
-        parts[family] = Part(
-            [Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7
-        )
+        parts[family] = Part([Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7)
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
     scenes = [family_scene(names[i % len(names)], first + i, *ground) for i in range(run.sizes.outcomes)]
     foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
@@ -309,9 +303,7 @@ def rows(run: Run, found: Found) -> list[Row]:
             beliefs = [one.believes_reached != one.success for one in here]
             made.append(rate_row(key, "test", family, "wrong_belief", beliefs))
         if key == OURS and family in CURVE_FAMILIES:
-            made.append(
-                rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here])
-            )
+            made.append(rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here]))
     for case, key in product(CASES, (OURS, *others)):
         scenes = [one.right[case] for one in found[OUTCOMES] if one.method == key and one.right[case]]
         if scenes:
@@ -383,9 +375,7 @@ DETAILS = TableSpec(
     ],
 )
 OVER_SEEDS = [
-    TableSpec(
-        f"{spec.title}, over training seeds", spec.columns, [Line(key=SEEDS, note="mean, lowest, highest")]
-    )
+    TableSpec(f"{spec.title}, over training seeds", spec.columns, [Line(key=SEEDS, note="mean, lowest, highest")])
     for spec in (GOALS, ENDS)
 ]
 BUDGET = TableSpec(

@@ -255,9 +255,7 @@ LINES = {
     )
 }  # fmt: skip
 ATTENDS_TABLES = [
-    TableSpec(
-        f"The named {role} attends most to its colour word", columns(metric, COLUMNS), [*LINES.values()]
-    )
+    TableSpec(f"The named {role} attends most to its colour word", columns(metric, COLUMNS), [*LINES.values()])
     for role, metric in zip(ROLES, METRICS, strict=True)
 ]
 ENDS_LINES = [LINES[method] for method in (OURS, NO_COLOR_TERM, WRONG)]

@@ -81,11 +81,7 @@ SAVI_SMALL = ModelConfig(
     predictor=SMALL,
 )
 SAVI_CATER = ModelConfig(
-    name="savi-cater",
-    parser=PUBLISHED_SAVI,
-    renderer=BroadcastConfig(),
-    text=PUBLISHED_TEXT,
-    predictor=PUBLISHED,
+    name="savi-cater", parser=PUBLISHED_SAVI, renderer=BroadcastConfig(), text=PUBLISHED_TEXT, predictor=PUBLISHED
 )
 PUBLISHED_DINO = replace(PUBLISHED_SAVI, image_size=336, num_slots=10, encoder="dinov2")
 # CLIPort at 336x336: 24x24 patches.

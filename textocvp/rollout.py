@@ -208,9 +208,7 @@ class Rollout:
         Raises:
             IndexError: if there is no such sequence.
         """
-        keep = _numbers(
-            len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index]
-        )
+        keep = _numbers(len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index])
         decoded = self._decoded
         kept = ({t: drawn[keep] for t, drawn in kind.items()} for kind in (decoded.masks, decoded.frames))
         return replace(

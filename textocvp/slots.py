@@ -82,9 +82,7 @@ class SlotState:
             ValueError: if the layout has no explicit channels, or its width is not D.
         """
         if not layout.explicit:
-            raise ValueError(
-                "these slots have no explicit colour, position or scale (layout.explicit is False)"
-            )
+            raise ValueError("these slots have no explicit colour, position or scale (layout.explicit is False)")
         if slots.shape[-1] != layout.dim:
             raise ValueError(f"slots are {slots.shape[-1]} wide, the layout says {layout.dim}")
         content, color, position, scale, presence = slots.split([layout.content, 3, 2, 2, 1], dim=-1)

@@ -15,10 +15,8 @@ from textocvp.presets import preset
 from textocvp.protocols import LoadCheckpoint
 from textocvp.training.run import STEP_FILE
 
-PRESETS = {"predictor": "tabletop-small", "parser": "savi-small"}
-"""Where the settings of each stage's runs start from."""
-PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}
-"""What each stage of training trains."""
+PRESETS = {"predictor": "tabletop-small", "parser": "savi-small"}  # where the settings of each stage's runs start from
+PARTS = {"parser": ("parser", "renderer"), "predictor": ("text", "predictor")}  # what each stage of training trains
 FIGURES = {"parser": ("quality.json",), "predictor": ("following.json", "slot_errors.json")}
 """What each stage writes last; `slot_errors.json` where the held-out episodes have no masks."""
 WHERE_FROM = ("weights", "fingerprint", "vocabulary", "untrained", "rewrites", "forms")
@@ -86,9 +84,7 @@ class FoundRun:
     def line(self) -> Line:
         """Its line of a table, with its updates, or why it is absent and what trains it."""
         if self.state == "trained":
-            return replace(
-                self.run, note=self.run.note + (f"; {self.updates} updates" if self.updates else "")
-            )
+            return replace(self.run, note=self.run.note + (f"; {self.updates} updates" if self.updates else ""))
         why = self.detail or f"train it: python experiments/train_ablations.py --only {self.run.key}"
         return replace(self.run, kind="control", note=f"{self.state}; {why}")
 

@@ -139,9 +139,7 @@ def without_color_term(model: object) -> WorldModel | None:
     return WorldModel(network, model.checkpoint) if gains else None
 
 
-def imagine(
-    model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int
-) -> tuple[list[np.ndarray], Rollout]:
+def imagine(model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int) -> tuple[list[np.ndarray], Rollout]:
     """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`."""
     horizon = min(HORIZON, model.longest_horizon or HORIZON)
     rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
@@ -151,9 +149,7 @@ def imagine(
 
 
 @torch.no_grad()
-def color_term(
-    model: WorldModel, parsed: Rollout, texts: Sequence[str], present_K: np.ndarray
-) -> list[np.ndarray]:
+def color_term(model: WorldModel, parsed: Rollout, texts: Sequence[str], present_K: np.ndarray) -> list[np.ndarray]:
     """What comparing each slot's colour with the lexicon's says by itself, as an attention of one step and head."""
     color_1K3 = SlotState.split(parsed.slots[:, 0], parsed.layout).color
     present_1K, merged = torch.from_numpy(present_K)[None], []

@@ -29,8 +29,7 @@ class Recorded:
     name: str
 
 
-Source = Recorded | StudyScene
-"""An episode in a file, or a scene of our own in which our expert plays one."""
+Source = Recorded | StudyScene  # an episode in a file, or a scene of our own in which our expert plays one
 
 
 def read(source: Source, worker: Worker) -> Episode:

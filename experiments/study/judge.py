@@ -32,9 +32,7 @@ class Verdicts:
     miss_SV: np.ndarray
 
 
-def find_things(
-    rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]
-) -> Grounding | None:
+def find_things(rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]) -> Grounding | None:
     """Which slot is what, by appearance on the first frame, which all rollouts of a batch share; None if unclear."""
     try:
         grounding = ground(rollout.select(0))

@@ -27,8 +27,7 @@ from planning import (
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
-HORIZON = 24
-"""Frames of an episode of the tabletop after the first one."""
+HORIZON = 24  # frames of an episode of the tabletop after the first one
 SPLITS = ("test", "unseen_colors", "more_objects")  # of the paper's figures
 Figures = Mapping[tuple[str, str, str], float]  # (split, variant, metric) -> figure
 Pairs = Sequence[tuple[float | None, float | None]]
@@ -175,8 +174,7 @@ METHODS: dict[str, Method] = {
 }  # fmt: skip
 BASELINES = tuple(key for key, method in METHODS.items() if method.kind == "baseline")
 """The models that ours is compared with, in the order of the tables."""
-PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)
-"""Who acts in the closed loop."""
+PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)  # who acts in the closed loop
 OURS_40 = "ours, 40 frames"
 TRAINED_LITTLE = (
     "The bundled baselines are small and were trained for minutes on two cores, as their cards say: none of them was "

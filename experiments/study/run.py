@@ -32,8 +32,7 @@ from experiments.study.scenes import scene_line
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel, SlotModel
 
-RESULTS = Path("results")
-"""Where every study writes by default."""
+RESULTS = Path("results")  # where every study writes by default
 LARGEST_SEED = 999  # each seed has scenes of its own, and a split has so many
 
 
@@ -266,10 +265,7 @@ class Run:
 def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
     """Run a study and write its folder. One that was interrupted goes on.
 
-    Args:
-        study: which.
-        args: the command line; by default as without options.
-        doubles: `load`, `sizes`, `loads` and `measures` of `Run`, whose errors come before any work is done.
+    `doubles` are `load`, `sizes`, `loads` and `measures` of `Run`, whose errors come before any work is done.
     """
     this = Run(study, args or study.args(), **doubles)
     _ = this.prepared  # may find that the model does not do
@@ -400,9 +396,7 @@ class OutputFolder:
             with tempfile.NamedTemporaryFile(dir=self.path, prefix=".writable-"):
                 pass
         except (FileExistsError, NotADirectoryError):
-            raise NotADirectoryError(
-                f"cannot write to {self.path}: a file of that name is in the way"
-            ) from None
+            raise NotADirectoryError(f"cannot write to {self.path}: a file of that name is in the way") from None
         except OSError as error:
             raise type(error)(f"cannot write to {self.path}: {error.strerror or error}") from None
 

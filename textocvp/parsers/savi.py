@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from textocvp.layers import PositionCode, init_relu_
-from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
+from textocvp.parsers.base import Generators, Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.parsers.efficientnet import LITE0, EfficientNetEncoder
@@ -87,10 +87,7 @@ class FeatureProjection(nn.Module):
         self.position = PositionCode(feature_dim) if place else nn.Identity()
         hidden = max(feature_dim, out_dim)
         self.mlp = nn.Sequential(
-            nn.LayerNorm(feature_dim),
-            nn.Linear(feature_dim, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, out_dim),
+            nn.LayerNorm(feature_dim), nn.Linear(feature_dim, hidden), nn.ReLU(), nn.Linear(hidden, out_dim)
         )
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
@@ -105,12 +102,7 @@ class GaussianInitializer(nn.Module):
         self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
         self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
 
-    def forward(
-        self,
-        batch: int,
-        num_slots: int,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Tensor:
+    def forward(self, batch: int, num_slots: int, generator: Generators = None) -> Tensor:
         """(batch, num_slots, D) slots."""
         size, mean = (num_slots, len(self.mean)), self.mean
         if isinstance(generator, Sequence):
@@ -233,7 +225,7 @@ class SaviParser(SceneParser):
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        generator: Generators = None,
         features_BTLF: Tensor | None = None,
     ) -> Parsed:
         """Parse clips; see `SceneParser.forward`.

@@ -126,9 +126,7 @@ class SlotPredictor(nn.Module):
         """A new layer."""
 
     @abstractmethod
-    def _transform(
-        self, x_BTKC: Tensor, state: RolloutState, newest_only: bool
-    ) -> tuple[Tensor, Tensor | None]:
+    def _transform(self, x_BTKC: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor | None]:
         """Apply the layers to one token for each slot of T frames, the last ones of `state.unused_BMK`.
 
         Returns:
@@ -222,9 +220,7 @@ class SlotPredictor(nn.Module):
         context = self._text_context(text, seed_BTKD, acting_BK)
         return RolloutState(context, caches, self.layout.used(seed_BTKD[:, :0]))
 
-    def _predict(
-        self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool
-    ) -> tuple[Tensor, Tensor | None]:
+    def _predict(self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor | None]:
         """The slots after every frame (B, T, K, D), or only after the newest (B, 1, K, D), and its attention."""
         start, T = state.cached, slots_BTKD.shape[1]
         unused_BTK = ~self.layout.used(slots_BTKD)

@@ -61,9 +61,7 @@ class Renderer(nn.Module):
         """Only the masks (B, K, H, W), for callers that look at no colours: a planner scores masks."""
         return self(slots_BKD).masks_BKHW
 
-    def remember(
-        self, frames_B3HW: Tensor, attention_BKhw: Tensor, slots_BKD: Tensor
-    ) -> tuple[Seen, ...] | None:
+    def remember(self, frames_B3HW: Tensor, attention_BKhw: Tensor, slots_BKD: Tensor) -> tuple[Seen, ...] | None:
         """What it keeps of B first frames, to draw the rest of each sequence with: `forward(slots_TKD, seen)`.
 
         Args:

@@ -18,14 +18,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from textocvp.layers import full_precision
-from textocvp.pretrained import (
-    CONFIG_FILE,
-    TOKENIZER_FILE,
-    WEIGHTS_FILE,
-    PretrainedFiles,
-    WeightsError,
-    read_model,
-)
+from textocvp.pretrained import CONFIG_FILE, TOKENIZER_FILE, WEIGHTS_FILE, PretrainedFiles, WeightsError, read_model
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
 
 if TYPE_CHECKING:
@@ -146,9 +139,7 @@ class PretrainedEncoder(TextEncoder):
             most = f"{config.kind} reads {longest} tokens at most"
             raise ValueError(f"text.max_tokens={config.max_tokens}: {most}")
         self.pad = self._architecture.pad_token_id
-        encoder = build_encoder(
-            self._architecture
-        )  # also where weights follow: a seed draws the rest as ever
+        encoder = build_encoder(self._architecture)  # also where weights follow: a seed draws the rest as ever
         if not stored and torch.get_default_device().type != "meta":  # where only shapes are asked for
             encoder.load_state_dict(build_encoder(self._architecture, folder).state_dict())
         self.frozen = FrozenStates(encoder) if config.frozen else None
