@@ -48,8 +48,7 @@ class Rollout:
     image_size: tuple[int, int]  # (H, W) in pixels
     layout: SlotLayout  # what the D numbers of a slot mean
     renderer: Renderer  # draws the slots
-    # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for.
-    attention: Tensor | None = None
+    attention: Tensor | None = None  # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for
     # What the renderer keeps of each sequence's first frame, which may be that of an earlier rollout.
     seen: tuple[Seen, ...] | None = None
     _decoded: _Decoded = field(default_factory=_Decoded)

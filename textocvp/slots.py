@@ -30,8 +30,7 @@ class SlotLayout:
     """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`."""
 
     content: int  # number of learned channels, which have no fixed meaning
-    # Whether the 8 explicit channels follow; in the published form they do not: D = content.
-    explicit: bool = True
+    explicit: bool = True  # whether the 8 explicit channels follow; in the published form they do not: D = content
 
     @property
     def dim(self) -> int:

@@ -188,8 +188,7 @@ class Line:
     """What a line of a table shows."""
 
     key: str  # `method` of the rows that it shows
-    # `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures
-    kind: Kind = "ours"
+    kind: Kind = "ours"  # `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures
     note: str = ""  # how it was measured, in a few words
     hue: int = 0  # colour in every plot, an index into the themes' series
     label: str = ""  # its name; the key if empty

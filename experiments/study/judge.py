@@ -28,8 +28,7 @@ class Verdicts:
     """One method on one scene, for its V instructions (original first) and S slot seeds."""
 
     success_SV: np.ndarray  # bool
-    # distance in pixels between block and bowl over the last frames; inf where one is not seen
-    miss_SV: np.ndarray
+    miss_SV: np.ndarray  # distance in pixels between block and bowl over the last frames; inf where one is not seen
 
 
 def find_things(rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]) -> Grounding | None:

@@ -120,8 +120,7 @@ class Part:
 
     # of work; for a part that follows from the results of others, nothing, and `cases` makes them later
     units: Sequence[Unit[Any]] = ()
-    # of a unit on one core, roughly; they make the first estimate of the time that is left
-    seconds: float = 1.0
+    seconds: float = 1.0  # of a unit on one core, roughly; they make the first estimate of the time that is left
     count: int = 0  # units that are expected of a part that follows from others
 
 
@@ -158,10 +157,8 @@ class Study:
     horizon: int = 1  # how many frames the model must be able to imagine at once
     # files whose content changes figures, beside the checkpoints of `methods`
     inputs: Callable[[Any], Sequence[Path]] = lambda args: ()
-    # more entries of `versions` in results.json
-    versions: Callable[[Run], Mapping[str, str]] = lambda run: {}
-    # more files of the folder: name -> text
-    files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}
+    versions: Callable[[Run], Mapping[str, str]] = lambda run: {}  # more entries of `versions` in results.json
+    files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}  # more files of the folder: name -> text
     # more tables, that are printed after the others
     printed: Callable[[Run, Results], Sequence[Table]] = lambda run, results: ()
     # makes what the study needs once, `Run.prepared`; raises UsageError if the model does not do

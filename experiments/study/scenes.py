@@ -25,8 +25,7 @@ class StudyScene:
 
     split: str  # its name, one of the environments' splits or of `LONG_GOALS`
     seed: int  # of the environment
-    # for `reset`; sorted items, so that a scene can be compared and hashed
-    options: tuple[tuple[str, Any], ...]
+    options: tuple[tuple[str, Any], ...]  # for `reset`; sorted items, so that a scene can be compared and hashed
     steps: int = 1  # pairs of the goal
     look: str = "simple"  # what it looks like: `scene` of the environment
     image_size: int = 64

@@ -39,8 +39,7 @@ class SaviConfig(ParserConfig):
     encoder_weights: str = ""
     encoder_dim: int = 768  # width of its features
     encoder_patch: int = 14  # side of its patches in pixels
-    # Of its weights, set when a model that has used them is saved; others are an error.
-    encoder_fingerprint: str = ""
+    encoder_fingerprint: str = ""  # of its weights, set when a model that has used them is saved; others are an error
     iterations_first: int = 1  # of the corrector on the first frame; later frames take one
     transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128

@@ -42,8 +42,7 @@ class PredictorConfig:
     hidden: int = 1024  # width within each feed-forward net
     attention: Literal["window", "causal"] = "window"  # see the module
     window: int = 10  # the longest past in frames; for `causal` also the longest rollout
-    # Of time codes, one per frame for all its slots.
-    age_encoding: Literal["learned", "sinusoidal"] = "learned"
+    age_encoding: Literal["learned", "sinusoidal"] = "learned"  # of time codes, one per frame for all its slots
     residual: bool = True  # predict the change of the slots instead of the slots
     feed_forwards: Literal[1, 2] = 2  # nets in a layer: 2 as in the authors' code, 1 as in the paper's text
     # Read and change content in units of its deviation over the training slots. The published model does not; explicit
@@ -86,8 +85,7 @@ class SlotPredictor(nn.Module):
     """
 
     Config: ClassVar[type[PredictorConfig]]
-    # Whether the text changes the prediction, and so whether there is attention to it.
-    uses_text: ClassVar[bool]
+    uses_text: ClassVar[bool]  # whether the text changes the prediction, and so whether there is attention to it
 
     content_mean_C: Tensor
     content_std_C: Tensor

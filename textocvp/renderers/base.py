@@ -38,8 +38,7 @@ class Seen:
     """What a renderer keeps of the first frame of one sequence, H and W its side: a multiple of the model's."""
 
     frame_3HW: Tensor  # -1..1
-    # The same without robot and things; what they hide is filled in from what they do not.
-    clean_3HW: Tensor
+    clean_3HW: Tensor  # the same without robot and things; what they hide is filled in from what they do not
     labels_HW: Tensor  # the number of the slot that each pixel belongs to, int64
     slots_KD: Tensor  # the slots of that frame
 

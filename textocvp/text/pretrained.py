@@ -36,12 +36,9 @@ class PretrainedTextConfig(TextConfig):
     """Options of `PretrainedEncoder`."""
 
     kind: Literal["t5", "minilm"] = "t5"
-    # Folder or hub id; empty for google-t5/t5-small from the hub, or the Python package of MiniLM.
-    weights: str = ""
-    # Keep the weights as they are and out of checkpoints; else they are fine-tuned and stored.
-    frozen: bool = True
-    # Of the frozen weights, set when they are first used; other weights are then an error.
-    fingerprint: str = ""
+    weights: str = ""  # folder or hub id; empty for google-t5/t5-small from the hub, or the Python package of MiniLM
+    frozen: bool = True  # keep the weights as they are and out of checkpoints; else they are fine-tuned and stored
+    fingerprint: str = ""  # of the frozen weights, set when they are first used; other weights are then an error
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
         return replace(self, fingerprint="")  # a new encoder may have other weights

@@ -61,10 +61,8 @@ class WordsConfig(TextConfig):
     layers: int = 2
     heads: int = 4
     hidden: int = 256
-    # The words that have an embedding of their own, in the order of its rows.
-    vocabulary: tuple[str, ...] = ()
-    # Those that no training caption contained: their embeddings are still random.
-    untrained: tuple[str, ...] = ()
+    vocabulary: tuple[str, ...] = ()  # the words that have an embedding of their own, in the order of its rows
+    untrained: tuple[str, ...] = ()  # those that no training caption contained: their embeddings are still random
     # How other wordings become those of the captions: rules for `textocvp.text.wording.reword`.
     rewrites: tuple[str, ...] = ()
     # What the training captions looked like, with {} for a colour; none where nobody listed them.
