@@ -59,22 +59,11 @@ class Speed:
 
 
 def measure(
-    name: str,
-    size: int,
-    hz: int,
-    stride: int,
-    episodes: int,
-    meshes: Path | None = None,
-    scene: str = "simple",
+    name: str, size: int, hz: int, stride: int, episodes: int, meshes: Path | None = None, scene: str = "simple"
 ) -> Speed:
     """Play expert episodes; with ``meshes``, next to the dense arm of that file."""
     env = gym.make(
-        "PutBlockInBowl-v0",
-        scene=scene,
-        image_size=size,
-        physics_hz=hz,
-        render_stride=stride,
-        record_frames=True,
+        "PutBlockInBowl-v0", scene=scene, image_size=size, physics_hz=hz, render_stride=stride, record_frames=True
     )
     world = env.unwrapped.world  # type: ignore[attr-defined]
     total = resets = 0.0
@@ -143,13 +132,8 @@ def main(args: Args) -> None:
         folder = Path(name)
         mesh = folder / "link.obj"
         _write_dense_link(mesh)
-        print(
-            f"{'CPU time':<28}{'ms/frame':>10}{'ms/step':>10}{'ms/reset':>10}{'s/episode':>12}{'frames':>8}"
-        )
-        for size, stride, bars in (
-            (64, 16, "2.5 ms a frame, 0.8 s an episode"),
-            (336, 8, "2.2 s an episode"),
-        ):
+        print(f"{'CPU time':<28}{'ms/frame':>10}{'ms/step':>10}{'ms/reset':>10}{'s/episode':>12}{'frames':>8}")
+        for size, stride, bars in ((64, 16, "2.5 ms a frame, 0.8 s an episode"), (336, 8, "2.2 s an episode")):
             ours = measure(f"ours {size}x{size}", size, 240, stride, args.episodes)
             print(ours.row(), flush=True)
             few = max(1, args.episodes // 5)

@@ -65,9 +65,7 @@ def play(scene: str, family: str, seeds: range) -> list[Played]:
 
 def main(args: Args) -> None:
     """Run and print."""
-    print(
-        f"{'family':<10}{'chance':>8}{'one random sentence':>21}{'expert':>9}   95 % interval     sentences"
-    )
+    print(f"{'family':<10}{'chance':>8}{'one random sentence':>21}{'expert':>9}   95 % interval     sentences")
     run = Parallel(n_jobs=args.workers, return_as="generator")
     every = run(delayed(play)(args.scene, family, range(args.episodes)) for family in FAMILIES)
     for family, results in zip(FAMILIES, every, strict=True):

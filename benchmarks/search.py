@@ -49,9 +49,7 @@ def foresight(model: WorldModel, sampled: SampledScene) -> Work:
         parsed = model.parse(image_1HW3)
         grounding = ground(parsed).with_kinds(goal.things)
         things = sorted(grounding.things)
-        return Wanted.of_relations(goal, things).ratios(
-            places(model.outcome(parsed, texts), grounding, things)
-        )
+        return Wanted.of_relations(goal, things).ratios(places(model.outcome(parsed, texts), grounding, things))
 
     return query
 

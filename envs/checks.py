@@ -22,6 +22,4 @@ def check_range(name: str, value: Any, low: float, high: float | None, whole: bo
     numeric = isinstance(value, kinds) and not isinstance(value, bool)
     if not numeric or not low <= value <= (inf if high is None else high):
         span = f"at least {low}" if high is None else f"{low} to {high}"
-        raise ValueError(
-            f"{name} must be {'a whole number' if whole else 'a number'} of {span}, not {value!r}"
-        )
+        raise ValueError(f"{name} must be {'a whole number' if whole else 'a number'} of {span}, not {value!r}")

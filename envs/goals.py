@@ -18,9 +18,7 @@ Floats = NDArray[np.float32]
 Reward = Literal["sparse", "dense"]
 REWARDS: tuple[Reward, ...] = ("sparse", "dense")
 
-FARTHEST = (
-    2.0  # metres from the origin along an axis to which places are clipped: things may fall off the table
-)
+FARTHEST = 2.0  # metres from the origin along an axis to which places are clipped: things may fall off the table
 REACH = 0.5  # metres from which on a distance counts in full in the dense reward
 GOALS = ("achieved_goal", "desired_goal")
 BEFORE = "achieved_before"  # where `info` has the achieved goal from before the step
@@ -83,9 +81,7 @@ def goal_vectors(task: Task, world: Tabletop, robot: Robot, scene: Scene) -> dic
     }
 
 
-def compute_reward(
-    reward: Reward, achieved: ArrayLike, desired: ArrayLike, info: Any = None
-) -> NDArray[np.float64]:
+def compute_reward(reward: Reward, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> NDArray[np.float64]:
     """The reward (...) of a step that led to ``achieved`` (..., D) where ``desired`` (..., D) was the goal.
 
     Args:

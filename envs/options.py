@@ -104,9 +104,7 @@ def read_scenes(scenes: Scenes) -> tuple[tuple[int, dict[str, Any]], ...]:
         except ValueError as error:
             raise ValueError(f"{path} is not a JSON file with a list of scenes: {error}") from None
     if not isinstance(scenes, Sequence) or isinstance(scenes, str) or not scenes:
-        raise ValueError(
-            f"scenes must be a list of at least one seed or mapping of reset options, not {scenes!r}"
-        )
+        raise ValueError(f"scenes must be a list of at least one seed or mapping of reset options, not {scenes!r}")
     found = []
     for number, scene in enumerate(scenes):
         options = dict(scene) if isinstance(scene, Mapping) else {"seed": scene}
@@ -117,9 +115,7 @@ def read_scenes(scenes: Scenes) -> tuple[tuple[int, dict[str, Any]], ...]:
     return tuple(found)
 
 
-def read_options(
-    options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, setup: Setup
-) -> ResetOptions:
+def read_options(options: Mapping[str, Any] | None, task: Task, defaults: SceneRequest, setup: Setup) -> ResetOptions:
     """Check `options`; what is not given comes from ``defaults``.
 
     Raises:
@@ -195,8 +191,7 @@ def _read_request(
         named = [thing for step in steps for thing in step.things]
         if len({thing.color for thing in named}) < len(named):
             raise ValueError(
-                "no two objects of a random scene share a colour, so its instruction must not "
-                "name a colour twice"
+                "no two objects of a random scene share a colour, so its instruction must not name a colour twice"
             )
         given |= {"instructions": steps, "named": tuple(thing.kind for thing in named)}
     return replace(defaults, **given)

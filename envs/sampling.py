@@ -72,11 +72,7 @@ def sample_objects(
 
 
 def place_objects(
-    rng: np.random.Generator,
-    request: SceneRequest,
-    things: Sequence[Thing],
-    carriers: dict[int, int],
-    sizes: Sizes,
+    rng: np.random.Generator, request: SceneRequest, things: Sequence[Thing], carriers: dict[int, int], sizes: Sizes
 ) -> tuple[ObjectSpec, ...]:
     """Draw places and yaws of things, by id.
 
@@ -122,9 +118,7 @@ def _draw_places(
             break
     else:
         count = len(standing)
-        raise ValueError(
-            f"{count} objects of this size do not fit on the table; use fewer, or a smaller scale"
-        )
+        raise ValueError(f"{count} objects of this size do not fit on the table; use fewer, or a smaller scale")
     for block, lower in carriers.items():
         # Within the millimetres that leave the block flat on a bowl's floor at any yaw.
         slack = max(0.0, sizes.bowl_floor_radius - sizes.footprint("block"))

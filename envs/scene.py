@@ -20,8 +20,7 @@ MAX_OBJECTS = 8  # as many objects as fit side by side into the workspace, each 
 TABLE, NOWHERE = -1, -2
 """Supports beside ids of objects: the table, and nothing that a sentence could name (held, askew, falling)."""
 
-HELD_HEIGHT = 2.5
-"""A block whose centre is higher than this many blocks hangs at the arm: no two blocks reach so high."""
+HELD_HEIGHT = 2.5  # a block whose centre is higher than this many blocks hangs at the arm: no two blocks reach so high
 
 
 class Thing(NamedTuple):
@@ -87,9 +86,7 @@ class ObjectSpec:
     def carried_by(self, support: int, objects: Sequence[ObjectSpec]) -> ObjectSpec:
         """The same object on another `support`, which counts as the table where it is no id of ``objects``."""
         kind = objects[support].kind if support >= 0 else "table"
-        return replace(
-            self, inside=support if kind == "bowl" else None, on=support if kind == "block" else None
-        )
+        return replace(self, inside=support if kind == "bowl" else None, on=support if kind == "block" else None)
 
 
 @dataclass(frozen=True)
@@ -179,9 +176,7 @@ def _find_supports(objects: list[ObjectSpec], sizes: Sizes, may_hang: bool) -> l
         inside = inside if on is None else None
         placed.append(replace(item, inside=inside, on=on, height=item.height if held else None))
     if sum(item.height is not None for item in placed) > 1:
-        raise ValueError(
-            "the arm can hold one block at the start, not several; see the heights in the layout"
-        )
+        raise ValueError("the arm can hold one block at the start, not several; see the heights in the layout")
     for bowl, count in Counter(item.inside for item in placed).items():
         if bowl is not None and count > 1:
             raise ValueError(f"the {placed[bowl].thing} has room for one block at the start, not {count}")

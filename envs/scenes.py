@@ -163,11 +163,7 @@ CLIPORT = Setup(
 )
 """CLIPort's scene in the paper's view: the whole arm, a wide table, grays."""
 
-SCENES: dict[str, Setup] = {
-    "simple": SIMPLE,
-    "cliport": CLIPORT,
-    "varied": replace(CLIPORT, factors=Factors()),
-}
+SCENES: dict[str, Setup] = {"simple": SIMPLE, "cliport": CLIPORT, "varied": replace(CLIPORT, factors=Factors())}
 """Name of a scene -> what it is. "varied" is "cliport" with all factors on."""
 
 

@@ -68,9 +68,7 @@ def read_observations(
         for name in names:
             check_choice("observation", name, (*always, *EXTRAS))
         if not names or extras:
-            raise ValueError(
-                "observations names all that there shall be, at least one, and goes without extras"
-            )
+            raise ValueError("observations names all that there shall be, at least one, and goes without extras")
         return tuple(dict.fromkeys(names))
     goals = ("goal", *GOALS) if "goal" in extras else ()
     return (*always, *(name for name in EXTRAS if name in (*extras, *goals)))

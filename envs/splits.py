@@ -61,14 +61,15 @@ class Split:
         }
 
 
-_ALL = (
-    Split("train", 0),
-    Split("val", 1),
-    Split("test", 2),
-    Split("unseen_colors", 3, color_split="unseen"),
-    Split("more_objects", 4, n_objects=8, bowls=(1, 5)),
-    # At least 4 bowls, so that three other target bowls exist; a plain start, as in the paper's study.
-    Split("controllability", 5, bowls=(4, 5), mid_task=0.0, target_in_bowl=0.0, moved_arm=0.0),
-)
-
-SPLITS: dict[str, Split] = {split.name: split for split in _ALL}
+SPLITS: dict[str, Split] = {
+    split.name: split
+    for split in (
+        Split("train", 0),
+        Split("val", 1),
+        Split("test", 2),
+        Split("unseen_colors", 3, color_split="unseen"),
+        Split("more_objects", 4, n_objects=8, bowls=(1, 5)),
+        # At least 4 bowls, so that three other target bowls exist; a plain start, as in the paper's study.
+        Split("controllability", 5, bowls=(4, 5), mid_task=0.0, target_in_bowl=0.0, moved_arm=0.0),
+    )
+}

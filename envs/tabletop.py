@@ -178,9 +178,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             wishes, factors = wishes | {"factors": factors}, None
         if unknown := set(wishes) - {*OPTIONS, *self.task.scene_options}:
             allowed = ", ".join([*OPTIONS, *self.task.scene_options])
-            raise TypeError(
-                f"unexpected argument {min(unknown)!r}; reset options that are arguments: {allowed}"
-            )
+            raise TypeError(f"unexpected argument {min(unknown)!r}; reset options that are arguments: {allowed}")
         self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         check_choice("reward", reward, REWARDS)
@@ -256,9 +254,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._show(setup, scene, joints)
         return self._observe(), self._info()
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """One pick-and-place, or one camera frame of tool motion.
 
         Raises:
@@ -445,9 +441,7 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
             "cliport_success": all(self.task.relation(pair).is_near(world, pair) for pair in goal),
             "instruction": self.scene.instruction,
             # As many rows always, so that vectorised environments can join them.
-            "target": np.array(
-                [*[pair[1:] for pair in goal], *[(-1, -1)] * (self.task.pairs[1] - len(goal))]
-            ),
+            "target": np.array([*[pair[1:] for pair in goal], *[(-1, -1)] * (self.task.pairs[1] - len(goal))]),
             "objects": [],
             "segmentation": self._recorder.images[-1].segmentation.copy(),
             "palette": world.setup.palette,

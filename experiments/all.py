@@ -55,8 +55,7 @@ class Args(StudyArgs):
         return study.args(out=self.folder("") / study.name, **{name: getattr(self, name) for name in known})
 
 
-Outcome = tuple[str, Tone, str]
-"""Of a study in this run: a word or two, their colour on the page, and what went wrong."""
+Outcome = tuple[str, Tone, str]  # of a study in this run: a word or two, their colour on the page, and what went wrong
 DONE: Outcome = ("done", "good", "")
 
 
@@ -69,7 +68,6 @@ def main(
     """Run what is not done yet; the exit status, 1 if a study failed.
 
     Args:
-        args: the command line.
         execute: runs one study and returns what went wrong, or nothing; by default `run_program`.
         studies: all there are, in order.
         load: makes the world model; by default loads `args.checkpoint`.
@@ -137,11 +135,7 @@ def run_program(study: Study, args: StudyArgs) -> str:
 
 
 def write_pages(
-    folder: OutputFolder,
-    args: Args,
-    weights: Checkpoint,
-    studies: Sequence[Study],
-    outcomes: Mapping[str, Outcome],
+    folder: OutputFolder, args: Args, weights: Checkpoint, studies: Sequence[Study], outcomes: Mapping[str, Outcome]
 ) -> None:
     """`index.html` and `summary.md`, of all results that are there."""
     entries, parts = [], []
@@ -181,9 +175,7 @@ def to_markdown(study: Study, results: Results) -> str:
     shown = [table for table in tables if table.measured()[1]] or [Table("Figure", ["value"], named)]
     weights = f"`{results.checkpoint.name}` ({results.checkpoint.sha256[:12]}), 95 % intervals in brackets."
     quick = "**Quick run**: a first look, not the figures to quote. " if results.quick else ""
-    return "\n".join(
-        [f"### {study.title}", *(f"\n{its.to_markdown()}" for its in shown), "", quick + weights, ""]
-    )
+    return "\n".join([f"### {study.title}", *(f"\n{its.to_markdown()}" for its in shown), "", quick + weights, ""])
 
 
 if __name__ == "__main__":

@@ -148,9 +148,7 @@ def report_looks(measured: Measured) -> bool:
     """Kinds and colours, told from the true masks."""
     widths, misnamed = measured.widths, measured.colors.count(False)
     quantiles("Apparent width in m", {f"{kind}s": its for kind, its in widths.items()}, digits=3)
-    wrong = {
-        kind: float(np.mean((np.array(its) > BOWL_WIDTH) != (kind == "bowl"))) for kind, its in widths.items()
-    }
+    wrong = {kind: float(np.mean((np.array(its) > BOWL_WIDTH) != (kind == "bowl"))) for kind, its in widths.items()}
     shares = " and ".join(f"{share:.4f} of {kind}s" for kind, share in wrong.items())
     CONSOLE.print(f"at {BOWL_WIDTH} m, {shares} are taken for the other kind")
     CONSOLE.print(f"{misnamed} of {len(measured.colors)} colours are misnamed\n")

@@ -22,15 +22,13 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from envs.dataset import EpisodeConfig, record_episode
-from envs.splits import SPLITS
-from envs.tabletop import TabletopEnv
 from envs.tasks.base import CLIPORT_RADIUS
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, Paper, TableSpec
 from experiments.study.any_size import Seen, drawn, film, fitted, imagine, mask_curves
+from experiments.study.cliport import Recorded, Source, misses, other_sentences, read
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
@@ -39,23 +37,9 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, hold_last
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
-from planning import (
-    THRESHOLDS,
-    BeamPlanner,
-    Goal,
-    Imagines,
-    Instruction,
-    LiteralController,
-    PinholeCamera,
-    Planner,
-    RandomPlanner,
-    Thing,
-)
-from planning.masks import centroids
+from planning import THRESHOLDS, BeamPlanner, Goal, Imagines, Instruction, LiteralController, Planner, RandomPlanner
 from textocvp.data import open_episodes
 from textocvp.data.cliport import CliportEpisodes
-from textocvp.data.episodes import Episode, EpisodeObject, Episodes
-from textocvp.metrics import object_ious
 
 SIDE = 336  # pixels of our own scenes, as in the paper
 ALL = "all"  # the split of figures over all episodes
@@ -119,9 +103,7 @@ PAPERS = {
     "true frames": _paper("parser on true frames", iou=(0.554, 0.553)),
     "copy frame": _paper("Copy-Seed", iou=(0.540, 0.525)),
 }  # fmt: skip
-MEASURED = lines(
-    ("ours", TAUGHT, LITE0, "Non-OC", "MAGE", "true frames", LITE0_PARSER, "wrong text", "copy frame")
-)
+MEASURED = lines(("ours", TAUGHT, LITE0, "Non-OC", "MAGE", "true frames", LITE0_PARSER, "wrong text", "copy frame"))
 LINES: dict[str, Line] = {line.key: replace(line, paper=PAPERS.get(line.key)) for line in MEASURED}
 LINES["SEER"] = Line(key="SEER", kind="baseline", note="not run", paper=PAPERS["SEER"])
 
@@ -168,35 +150,6 @@ class CliportLoop(LoopEpisode):
 # --- episodes ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """An episode in a file."""
-
-    opened: Episodes
-    index: int
-    split: str
-    name: str
-
-
-Source = Recorded | StudyScene
-"""An episode in a file, or a scene of our own in which our expert plays one."""
-
-
-def read(source: Source, worker: Worker) -> Episode:
-    """All of an episode."""
-    if isinstance(source, Recorded):
-        return source.opened.episode(source.index)
-    env = cast(TabletopEnv, worker.environment(source).unwrapped)
-    number = source.seed - SPLITS[source.split].first_seed
-    played = record_episode(env, EpisodeConfig(source.split), number)
-    camera, arrays = env.world.camera, played.arrays
-    return Episode(
-        frames=arrays["frames"], instruction=played.instruction, segmentation=arrays["segmentation"],
-        objects=tuple(EpisodeObject(**item) for item in played.objects), position=arrays["object_position"],
-        intrinsics=camera.intrinsics, extrinsics=camera.extrinsics,
-    )  # fmt: skip
-
-
 def own_scenes(run: Run, count: int, side: int) -> list[StudyScene]:
     """So many of each split, looking like CLIPort's."""
     seed = run.args.seed
@@ -238,43 +191,6 @@ def inputs(args: Args) -> list[Path]:
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
-
-
-def misses(labels_THW: np.ndarray, truth: Episode, asked: Instruction) -> np.ndarray | None:
-    """How far from the named bowl the named block comes to lie, by CLIPort's criterion.
-
-    The block starts at its true place and is moved as the masks of the slot that has it in the first frame: through
-    the camera, from the height at which it stood to the height at which it comes to lie. The bowl's place is where it
-    stood at the start, as in CLIPort.
-
-    Returns:
-        (t,) metres in the plane, in each of the last frames; inf where no pixel shows the block. None where the truth
-        is not known, or a name fits no object or several.
-    """
-    block, bowl = ([o for o in truth.objects if Thing(o.color, o.kind) == thing] for thing in asked.things)
-    segmentation, places, K, E = truth.segmentation, truth.position, truth.intrinsics, truth.extrinsics
-    if len(block) != 1 or len(bowl) != 1 or segmentation is None or places is None or K is None or E is None:
-        return None
-    matched = object_ious(labels_THW[0], segmentation[0], [o.label for o in truth.objects], min_pixels=1)
-    slot = max(matched.slots[matched.ids == block[0].label], default=-1)
-    start, end = places[[0, -1], block[0].id]
-    camera = PinholeCamera(K, E)
-
-    def place(labels_HW: np.ndarray, height: float) -> np.ndarray:
-        center = centroids(torch.from_numpy(labels_HW == slot)).numpy()
-        return np.full(2, np.nan) if np.isnan(center).any() else camera.unproject_to_plane(center, height)[:2]
-
-    offset = place(labels_THW[0], float(start[2])) - start[:2]
-    last = np.stack([place(labels, float(end[2])) for labels in labels_THW[-THRESHOLDS.settle_frames :]])
-    return np.nan_to_num(np.linalg.norm(last - offset - places[0, bowl[0].id, :2], axis=1), nan=np.inf)
-
-
-def other_sentences(truth: Episode, asked: Instruction) -> tuple[list[Instruction], Instruction]:
-    """The sentence with each other bowl of the scene; and one with another block and another bowl, if there are any."""
-    things = sorted({Thing(o.color, o.kind) for o in truth.objects})
-    blocks, bowls = ([t for t in things if t.kind == one.kind and t != one] for one in asked.things)
-    wrong = replace(asked, thing=[*blocks, asked.thing][0], target=[asked.target, *bowls][-1])
-    return [replace(asked, target=bowl) for bowl in bowls], wrong
 
 
 @dataclass(frozen=True)
@@ -425,9 +341,7 @@ def headline(run: Run) -> dict[str, Key]:
             named[f"{metric}_{n}{ending}"] = (method, ALL, variant, metric)
         named[f"success_original{ending}"] = (method, ALL, "original", "success")
         named[f"success_variants{ending}"] = (method, ALL, "other bowls", "success")
-    for split, (method, ending) in product(
-        OWN_SPLITS, {"ours": "", "no imagination": "_no_imagination"}.items()
-    ):
+    for split, (method, ending) in product(OWN_SPLITS, {"ours": "", "no imagination": "_no_imagination"}.items()):
         named[f"closed_loop_{split}{ending}"] = (method, split, "original", "closed_loop_success")
     return named
 

@@ -18,7 +18,7 @@ into `--out`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -28,13 +28,12 @@ from typing import Any, Literal, cast
 
 import gymnasium as gym
 import numpy as np
-import torch
 import tyro
 
 from envs import Expert
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
-from envs.tasks.rearrange import FAMILIES, Rearrange
+from envs.tasks.rearrange import FAMILIES
 from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.plots import plot_table
@@ -42,53 +41,48 @@ from experiments.report.results import EpisodeLine, Results
 from experiments.report.rows import Key, Row, by_key, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import tone
+from experiments.study.foresight import (
+    BUDGETS,
+    CASES,
+    CURVE,
+    LINES,
+    OURS,
+    SENTENCES,
+    ByFilms,
+    Foresight,
+    Searcher,
+    foresight,
+)
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import to_uint8
 from experiments.study.run import Found, Part, Run, Study, StudyArgs, UsageError, start
 from experiments.study.scenes import SCENES_PER_SEED, StudyScene, scene_hash
 from planning import (
     AnyGoal,
-    AnySentencePlanner,
     AppearanceGrounder,
-    BelievingPlanner,
     EpisodeResult,
-    Foresees,
     Goal,
-    Grounder,
-    Grounding,
     LiteralController,
-    LiteralPlanner,
     PictureGoal,
-    Planner,
-    SearchPlanner,
     SegmentationGrounder,
-    Thing,
-    Wanted,
     observe,
     places,
     run_episode,
-    seen_supports,
 )
-from planning.masks import centroids
 from planning.search import HORIZON
 from textocvp.checkpoint import WEIGHTS_FILE
 from textocvp.protocols import LoadCheckpoint, LoadModel
-from textocvp.rollout import Rollout
 
 FIRST, APART = 5_000, 500  # seeds of the test split that no other study uses: so many for each family
 OUTCOMES = "outcomes"  # the part of sentences whose ends are foreseen
 FIRST_OUTCOME = 8_500
-SENTENCES = 6  # that are played in a row in each of its scenes
 ATTEMPTS = {"plain": 2, "occupied": 3, "covered": 3, "swap": 4, "tower": 3, "picture": 5}
 """Pick-and-places at most: one more than the goals of the family need at least (of a picture: at most)."""
 SUCCESS, RIGHT = "closed_loop_success", "outcome_right"
-CASES = ("plain", "occupied", "covered", "both")
-"""What a sentence finds: nothing on the thing and nothing at the target; something at the target, on the thing, or at
-both."""
-BUDGETS = (15, 60, 250, 1000)
 TIMED, TIMES = 30, 15  # so many sentences, so often
 SIDE, CLOSE_SIDE = 336, 64  # pixels of a side of the pictures: of scenes `cliport`, and `simple`
-MakeSearch = Callable[[Foresees, int], Planner]
+CURVE_FAMILIES = ("swap", "picture")  # whose search is also measured with smaller budgets
+SEEDS = "ours, over training seeds"
 
 
 @dataclass
@@ -106,93 +100,16 @@ class Args(StudyArgs):
             self.checkpoint = "cliport"
         for name in self.retrained:
             if not (Path(name) / WEIGHTS_FILE).is_file():
-                raise UsageError(
-                    f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}"
-                )
+                raise UsageError(f"--retrained must be the folder of a checkpoint, and {name} has no {WEIGHTS_FILE}")
+
+    @property
+    def others(self) -> dict[str, LoadCheckpoint]:
+        """The checkpoints of other training seeds: key of the line -> makes the model."""
+        return {f"retrained {i}": LoadCheckpoint(name) for i, name in enumerate(self.retrained, 1)}
 
     def folder(self, study: str) -> Path:
         """See `StudyArgs.folder`; each scene has its own."""
         return super().folder(study if self.scene == "simple" else f"{study}-{self.scene}")
-
-
-class ByFilms:
-    """A model without a predictor of whole sentences: it foresees where one leads by its whole film."""
-
-    def __init__(self, model: Foresees) -> None:
-        self.parse, self.rollout, self.longest_horizon = model.parse, model.rollout, model.longest_horizon
-
-    def outcome(self, obs: Rollout, text: Sequence[str], *, seed: int = 0) -> Rollout:
-        """See `Foresees`."""
-        film = self.rollout(obs, text, horizon=self.longest_horizon or HORIZON, seed=seed)
-        return replace(film, slots=film.slots[:, [0, -1]])
-
-
-def foresight(model: object) -> Foresees:
-    """The model, or what makes it foresee."""
-    foresees = cast(Foresees, model)
-    return foresees if getattr(model, "foresees", True) else ByFilms(foresees)
-
-
-@dataclass
-class TrueSlotsPlanner(SearchPlanner):
-    """The same search, but slots are named and placed by the simulator's segmentation. A ceiling row."""
-
-    def look(self, rgb: np.ndarray, goal: AnyGoal, grounder: Grounder) -> tuple[Rollout, Grounding, Wanted]:
-        """See `SearchPlanner.look`; what hides in the picture stays where it was parsed."""
-        parsed, grounding, wanted = super().look(rgb, goal, grounder)
-        assert isinstance(grounder, SegmentationGrounder)
-        positions_1K2 = parsed.positions[:, -1].clone()
-        for item in grounder.objects:
-            slots = list(grounding.things.get(Thing(item["color"], item["kind"]), ()))
-            mask_HW = torch.as_tensor(grounder.segmentation == item["label"])
-            if slots and mask_HW.any():
-                positions_1K2[:, slots] = centroids(mask_HW)
-        return parsed.moved(positions_1K2, [""]).last, grounding, wanted
-
-
-@dataclass(frozen=True, kw_only=True)
-class Searcher(Line):
-    """A line of the tables, and the planner behind it; None for the scripted search in the simulator."""
-
-    plan: MakeSearch | None = None
-    privileged: bool = False  # whether the simulator's segmentation says which slot is what
-    pictures: bool = True  # whether it takes pictures as goals; for these there is no segmentation either
-
-
-def _with_budget(budget: int) -> MakeSearch:
-    return lambda model, seed: SearchPlanner(model, budget=budget)
-
-
-OURS = "ours"
-LINES: dict[str, Searcher] = {
-    line.key: line
-    for line in (
-        Searcher(key=OURS, hue=0, note="searches what it foresees", plan=_with_budget(BUDGETS[-1])),
-        Searcher(key="no imagination", kind="control", hue=2, pictures=False,
-                 note="carries out the goal's own sentences, in order",
-                 plan=lambda model, seed: LiteralPlanner(model)),
-        Searcher(key="believes", kind="control", hue=4, note="the same search; every sentence comes true as it says",
-                 plan=lambda model, seed: BelievingPlanner(model)),
-        Searcher(key="random", kind="control", hue=5, note="any sentence that the scene allows",
-                 plan=lambda model, seed: AnySentencePlanner(model, rng=np.random.default_rng(seed))),
-        Searcher(key="ours, slots from the simulator", kind="ceiling", hue=3, privileged=True, pictures=False,
-                 note="the same, but slots are named and placed by the simulator's segmentation",
-                 plan=lambda model, seed: TrueSlotsPlanner(model, budget=BUDGETS[-1])),
-        Searcher(key="simulator", kind="ceiling", hue=1, note="searches in a copy of the simulator, knows every pose"),
-    )
-}  # fmt: skip
-"""Who is measured in every family."""
-CURVE = {
-    f"budget {budget}": Searcher(key=f"budget {budget}", hue=0, note="ours", plan=_with_budget(budget))
-    for budget in BUDGETS[:-1]
-}
-CURVE_FAMILIES = ("swap", "picture")
-SEEDS = "ours, over training seeds"
-
-
-def retrained(names: Sequence[str]) -> dict[str, str]:
-    """Lines of checkpoints of other training seeds: key -> checkpoint."""
-    return {f"retrained {i}": name for i, name in enumerate(names, 1)}
 
 
 @dataclass(frozen=True)
@@ -251,28 +168,19 @@ class Episode:
 
     def run(self, worker: Worker) -> Played:
         """Play it."""
-        env, searcher = worker.environment(self.scene, record=False), self.searcher
+        env = worker.environment(self.scene, record=False)
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
-        if searcher.plan is None:
-            said = []
-            expert = Expert(env)
+        goal = info["instruction"]
+        if self.searcher.plan is None:
+            said, expert, base = [], Expert(env), cast(TabletopEnv, env.unwrapped)
             for pair in expert.search()[: ATTEMPTS[self.family]]:
-                base = cast(TabletopEnv, env.unwrapped)
                 said.append(base.task.scene(base.scene.objects, (pair,)).instruction)
                 info = env.step(expert.primitive(pair))[4]
-            return Played(self, info["instruction"], bool(info["is_success"]), None, tuple(said), ())
+            return Played(self, goal, bool(info["is_success"]), None, tuple(said), ())
         result = self.pursue(worker, env, goal_of(observation, info))
-        said = [attempt.instruction.text for attempt in result.attempts]
+        texts = tuple(attempt.instruction.text for attempt in result.attempts)
         seconds = tuple(attempt.plan.seconds for attempt in result.attempts)
-        return Played(
-            self,
-            info["instruction"],
-            result.success,
-            result.believes_reached,
-            tuple(said),
-            seconds,
-            result.error,
-        )
+        return Played(self, goal, result.success, result.believes_reached, texts, seconds, result.error)
 
     def pursue(self, worker: Worker, env: gym.Env[Any, Any], goal: AnyGoal) -> EpisodeResult:
         """Plan and act; see `run_episode`."""
@@ -299,51 +207,6 @@ def goal_of(observation: Mapping[str, Any], info: Mapping[str, Any]) -> AnyGoal:
 
 
 @dataclass(frozen=True)
-class Foreseen:
-    """What was foreseen of one scene: for each case, of each sentence whether it was right."""
-
-    method: str
-    right: Mapping[str, Sequence[bool]]
-
-
-@dataclass(frozen=True)
-class Foresight:
-    """A unit of work: random sentences, one after another, each foreseen before it is played."""
-
-    scene: StudyScene
-    seed: int
-    method: str = OURS
-    load: LoadModel | None = None  # as of `Episode`
-
-    def run(self, worker: Worker) -> Foreseen:
-        """Play and compare: right is what ends with every block carried by what it was foreseen to be carried by."""
-        env = worker.environment(self.scene, record=False)
-        observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
-        base, rng = cast(TabletopEnv, env.unwrapped), np.random.default_rng([self.seed, self.scene.seed])
-        model = foresight(worker.world_model if self.load is None else worker.model(self.load))
-        task = cast(Rearrange, base.task)
-        right: dict[str, list[bool]] = {case: [] for case in CASES}
-        for _ in range(SENTENCES):
-            pairs = task.sentences(base.scene.objects, "seen")
-            pair = pairs[int(rng.integers(len(pairs)))]
-            text = task.scene(base.scene.objects, (pair,)).instruction
-            before, grounder = info["supports"], SegmentationGrounder.from_info(info)
-            parsed, grounding = observe(model, observation["rgb"], PictureGoal(observation["rgb"]), grounder)
-            things = sorted(grounding.things)
-            ends_1N2 = places(model.outcome(parsed, [text]), grounding, things)
-            foreseen = seen_supports(ends_1N2, things, grounding.view)[0]
-            observation, *_, info = env.step(Expert(env).primitive(pair))
-            named = [Thing(item["color"], item["kind"]) for item in info["objects"]]
-            carriers = [None if at < 0 else named[at] for at in info["supports"]]
-            true = {one: at for one, at in zip(named, carriers, strict=True) if one.kind == "block"}
-            covered = pair.thing in before
-            taken = any(at == pair.target and one != pair.thing for one, at in enumerate(before))
-            case = CASES[2 * covered + taken]
-            right[case].append(foreseen == true)
-        return Foreseen(self.method, right)
-
-
-@dataclass(frozen=True)
 class ConsequenceClip:
     """A unit of work: the film of the obvious sentence as imagined, beside what ours does and what the camera sees."""
 
@@ -359,34 +222,23 @@ class ConsequenceClip:
         horizon = model.longest_horizon or HORIZON
         if episode.scene.look == "simple":  # in others the arm takes longer
             horizon = min(HORIZON, horizon)
-        films = []
-        if isinstance(goal, Goal):
-            obvious = model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon)
-            films.append(to_uint8(obvious.frames[0]))
+        if said_at_once := isinstance(goal, Goal):
+            first = to_uint8(model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon).frames[0])
         else:
-            films.append(goal.rgb[None])
+            first = goal.rgb[None]
         result = episode.pursue(worker, env, goal)
-        taken = [
-            model.rollout(attempt.rgb, attempt.instruction.text, horizon=horizon)
-            for attempt in result.attempts
-        ]
-        films += [
+        taken = [model.rollout(one.rgb, one.instruction.text, horizon=horizon) for one in result.attempts]
+        films = [
+            first,
             np.concatenate([to_uint8(one.frames[0]) for one in taken] or [result.frames[:1]]),
             result.frames,
         ]
         said = "; ".join(text.removeprefix("put ") for text in self.played.said) or "nothing"
+        scale = 2 if episode.scene.image_size == CLOSE_SIDE else 1
         return Clip(
             name=f"imagination-{self.rank}.gif",
-            gif=gif(
-                [[film[::2] if len(film) > 1 else film for film in films]],
-                seconds_a_frame=0.2,
-                scale=2 if episode.scene.image_size == CLOSE_SIDE else 1,
-            ),
-            panels=(
-                "the goal, said at once" if isinstance(goal, Goal) else "the goal",
-                "the plan",
-                "what happened",
-            ),
+            gif=gif([[film[::2] for film in films]], seconds_a_frame=0.2, scale=scale),
+            panels=("the goal, said at once" if said_at_once else "the goal", "the plan", "what happened"),
             title=self.played.goal,
             caption=f"{episode.family}, seed {episode.scene.seed}; said: {said}",
             badge="success" if result.success else "failure",
@@ -412,15 +264,13 @@ def ground_of(run: Run) -> tuple[str, int]:
 def units(run: Run) -> dict[str, Part]:
     """Every episode, family by family, and the sentences that are foreseen."""
     parts, seed, ground = {}, run.args.seed, ground_of(run)
-    others = {key: LoadCheckpoint(name) for key, name in retrained(cast(Args, run.args).retrained).items()}
+    others = cast(Args, run.args).others
     for place, family in enumerate(FAMILIES):
         first = SCENES_PER_SEED * seed + FIRST + APART * place
         scenes = [family_scene(family, first + i, *ground) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
         keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
-        parts[family] = Part(
-            [Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7
-        )
+        parts[family] = Part([Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7)
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
     scenes = [family_scene(names[i % len(names)], first + i, *ground) for i in range(run.sizes.outcomes)]
     foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
@@ -442,7 +292,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 
 def rows(run: Run, found: Found) -> list[Row]:
     """Success and sentences of every line and family; how often the end of a sentence was foreseen."""
-    made, others = [], retrained(cast(Args, run.args).retrained)
+    made, others = [], cast(Args, run.args).others
     for family, key in product(FAMILIES, [*LINES, *CURVE, *others]):
         here = [one for one in found[family] if one.episode.method == key]
         if not here:
@@ -453,9 +303,7 @@ def rows(run: Run, found: Found) -> list[Row]:
             beliefs = [one.believes_reached != one.success for one in here]
             made.append(rate_row(key, "test", family, "wrong_belief", beliefs))
         if key == OURS and family in CURVE_FAMILIES:
-            made.append(
-                rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here])
-            )
+            made.append(rate_row(f"budget {BUDGETS[-1]}", "test", family, SUCCESS, [one.success for one in here]))
     for case, key in product(CASES, (OURS, *others)):
         scenes = [one.right[case] for one in found[OUTCOMES] if one.method == key and one.right[case]]
         if scenes:
@@ -527,9 +375,7 @@ DETAILS = TableSpec(
     ],
 )
 OVER_SEEDS = [
-    TableSpec(
-        f"{spec.title}, over training seeds", spec.columns, [Line(key=SEEDS, note="mean, lowest, highest")]
-    )
+    TableSpec(f"{spec.title}, over training seeds", spec.columns, [Line(key=SEEDS, note="mean, lowest, highest")])
     for spec in (GOALS, ENDS)
 ]
 BUDGET = TableSpec(
@@ -553,6 +399,11 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     figures, (look, side) = list(results.rows), ground_of(run)
     goals, ends = (replace(one, title=f"{one.title}, scenes {look}") for one in (GOALS, ENDS))
+    other_seeds = Section(
+        "Other training seeds",
+        "Beside the model above others of the same recipe, whose predictors were trained with other seeds.",
+        [spec.table(figures) for spec in OVER_SEEDS],
+    )
     return [
         Section(
             "Goals that need foresight",
@@ -569,7 +420,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "its target. Occupied: something is at the target. Covered: something is on the block.",
             [ends.table(figures), DETAILS.table(figures)],
         ),
-        *_over_seeds(run, figures),
+        *([other_seeds] if cast(Args, run.args).retrained else []),
         Section(
             "How much search it takes",
             "The same planner, with fewer sentences to imagine for each plan.",
@@ -582,13 +433,6 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             [Clips(found["clips"])] if found["clips"] else [],
         ),
     ]
-
-
-def _over_seeds(run: Run, figures: Sequence[Row]) -> list[Section]:
-    if not cast(Args, run.args).retrained:
-        return []
-    text = "Beside the model above others of the same recipe, whose predictors were trained with other seeds."
-    return [Section("Other training seeds", text, [spec.table(figures) for spec in OVER_SEEDS])]
 
 
 STUDY = Study(
@@ -618,9 +462,7 @@ STUDY = Study(
     ],
     headline=HEADLINE,
     first=("plain", "occupied", "covered", "swap", "tower", "picture"),
-    files=lambda run, found: {
-        "timings.json": json.dumps(seconds(found), indent=2) + "\n",
-    },
+    files=lambda run, found: {"timings.json": json.dumps(seconds(found), indent=2) + "\n"},
 )
 
 if __name__ == "__main__":

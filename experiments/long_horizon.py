@@ -218,13 +218,7 @@ DETAILS = TableSpec(
         Line(key=key, kind=LINES[key].kind, metric=metric, label=f"{label}, {key}", digits=digits, note=note)
         for keys, metric, label, digits, note in (
             ((*OURS, EXPERT), "steps", "pick-and-places", 1, ""),
-            (
-                OURS,
-                "wrong_belief",
-                "wrong belief",
-                2,
-                "the planner's verdict at the end is not the simulator's",
-            ),
+            (OURS, "wrong_belief", "wrong belief", 2, "the planner's verdict at the end is not the simulator's"),
             ((OURS[1], ANY_ORDER), "empties_first", "empties the bowl first", 2, ""),
             (OURS[:1], "seconds", "seconds a plan", 2, "on one core, as busy as it was; not in results.json"),
         )
@@ -251,9 +245,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     for title, value in seconds(found).get(OURS[0], {}).items():
         figures.append(Row(OURS[0], *COLUMNS[title], "seconds", value, value, value, 1))
     caption = "Dots with 95 % intervals over scenes; all but the first carry out one plan."
-    success = plot_table(
-        "success.png", GOALS, figures, label="whole goal reached", caption=caption, lines=PLOTTED
-    )
+    success = plot_table("success.png", GOALS, figures, label="whole goal reached", caption=caption, lines=PLOTTED)
     return [
         Section(
             "Whole goals",

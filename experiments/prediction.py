@@ -22,15 +22,7 @@ from experiments.report.results import Results
 from experiments.report.rows import Key, Row, interval_row, mean_row
 from experiments.report.tables import Column, Line, TableSpec
 from experiments.study.clips import PredictionClip, best_and_worst, extreme_clips
-from experiments.study.frame_metrics import (
-    BOTTOM_ROWS,
-    METRICS,
-    PSNR_CAP,
-    UPPER,
-    FrameScores,
-    Measures,
-    Scorer,
-)
+from experiments.study.frame_metrics import BOTTOM_ROWS, METRICS, PSNR_CAP, UPPER, FrameScores, Measures, Scorer
 from experiments.study.frame_metrics import available_measures as available
 from experiments.study.methods import BASELINES, HORIZON, METHODS, OURS_40, TRAINED_LITTLE, Model, lines
 from experiments.study.pool import Unit, Worker

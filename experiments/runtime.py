@@ -100,8 +100,7 @@ class Timing:
         return threads_word(self.threads), variant
 
 
-Seconds = Mapping[tuple[str, Timing], np.ndarray]
-"""(name of who was timed, what was timed) -> (rounds,) seconds."""
+Seconds = Mapping[tuple[str, Timing], np.ndarray]  # (name of who was timed, what was timed) -> (rounds,) seconds
 
 
 def threads_word(count: int) -> str:
@@ -156,9 +155,7 @@ class Subject:
         seen = replace(parsed, slots=parsed.slots.expand(-1, what.frames, -1, -1))
         return {
             "encode": lambda: world_model.parse(images_BHW3[:, None]),
-            "predict": lambda: model.predictor.rollout(
-                slots, model.text(texts), what.frames, use_cache=cached
-            ),
+            "predict": lambda: model.predictor.rollout(slots, model.text(texts), what.frames, use_cache=cached),
             # A selection of it each time: what a rollout has drawn it does not draw again.
             "decode": lambda: seen.select(slice(None)).frames,
         }
@@ -314,9 +311,7 @@ def rows(run: Run, found: Found) -> list[Row]:
         ):
             if meant and (name, above) in seconds and (name, below) in seconds:
                 a, b = (median_interval(seconds[name, one]) for one in (above, below))
-                value, low, high = (
-                    x / y / factor for x, y in ((a.value, b.value), (a.low, b.high), (a.high, b.low))
-                )
+                value, low, high = (x / y / factor for x, y in ((a.value, b.value), (a.low, b.high), (a.high, b.low)))
                 ratio = Interval(value, low, high, min(a.n, b.n))
                 made.append((f"{name}: {label}", what, "ratio", ratio))
     return [interval_row(name, *what.place, metric, interval) for name, what, metric, interval in made]
@@ -354,12 +349,8 @@ def headline(run: Run) -> dict[str, Key]:
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 _PAIRS = [*AGAINST.items(), *((key, OURS) for key in (*BASELINES, PAPER_CACHE))]
-RATIOS = [
-    Line(key=f"{name} / {other}", kind="ours" if name == WINDOW else "control") for name, other in _PAIRS
-]
-RATIOS += [
-    Line(key=f"{line.key}: {label}", kind="control") for label in (DECODE, BATCH, THREADS) for line in LINES
-]
+RATIOS = [Line(key=f"{name} / {other}", kind="ours" if name == WINDOW else "control") for name, other in _PAIRS]
+RATIOS += [Line(key=f"{line.key}: {label}", kind="control") for label in (DECODE, BATCH, THREADS) for line in LINES]
 
 
 def phase_spec(metric: str, threads: int, sizes: Sizes = DEFAULT) -> TableSpec:

@@ -4,9 +4,9 @@
     python experiments/train_ablations.py --list                # what there is, and what is still to be trained
     python experiments/train_ablations.py --only layers-1 --only residual-off
 
-What is trained with which settings stands in `experiments/ablations.py`, which measures it afterwards. Stop at any
-moment and start again: finished runs are skipped, an unfinished one goes on where it was. The episodes are parsed
-once, and all predictor runs share those slots.
+What is trained with which settings stands in `experiments/study/ablation_runs.py`; `experiments/ablations.py` measures
+it afterwards. Stop at any moment and start again: finished runs are skipped, an unfinished one goes on where it was.
+The episodes are parsed once, and all predictor runs share those slots.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from experiments.ablations import RUNS, AblationRun, find_run, runs_table
+from experiments.study.ablation_runs import RUNS, AblationRun, find_run, runs_table
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, resolve_checkpoint
 from textocvp.data import open_episodes
 from textocvp.data.cache import cached_slots

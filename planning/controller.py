@@ -98,9 +98,7 @@ class LiteralController:
             pile.append(thing)
         return thing
 
-    def _height(
-        self, rollout: Rollout, grounding: Grounding, thing: Thing, center: NDArray[np.float64]
-    ) -> float:
+    def _height(self, rollout: Rollout, grounding: Grounding, thing: Thing, center: NDArray[np.float64]) -> float:
         """Metres above the table of the point that a thing's slot is centred on, by what it is seen to stand on."""
         for relation in RELATIONS.values():
             if thing.kind != relation.kinds[0]:

@@ -161,9 +161,7 @@ def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette) -> list[Gr
     return [_ground_scene(*scene, View(camera), palette) for scene in scenes]
 
 
-def _ground_scene(
-    masks_KHW: Bools, colors_K3: Floats, present_K: Bools, view: View, palette: Palette
-) -> Grounding:
+def _ground_scene(masks_KHW: Bools, colors_K3: Floats, present_K: Bools, view: View, palette: Palette) -> Grounding:
     area_K, zoom = masks_KHW.sum((1, 2)), view.zoom_at_middle
     largest = int(area_K.argmax())
     names = list(palette.colors)
@@ -228,9 +226,7 @@ def ground_by_segmentation(
     masks_BKHW = frame_masks(rollout, 0)
     truth_BHW = np.broadcast_to(segmentation, (len(masks_BKHW), *np.shape(segmentation)[-2:]))
     if truth_BHW.shape[1:] != masks_BKHW.shape[2:]:
-        raise ValueError(
-            f"segmentation is {truth_BHW.shape[1:]}, the rollout's masks are {masks_BKHW.shape[2:]}"
-        )
+        raise ValueError(f"segmentation is {truth_BHW.shape[1:]}, the rollout's masks are {masks_BKHW.shape[2:]}")
     labels = [BACKGROUND, ROBOT, *(item["label"] for item in objects)]
     groundings = []
     for masks_KHW, truth_HW in zip(masks_BKHW, truth_BHW, strict=True):
@@ -241,9 +237,7 @@ def ground_by_segmentation(
     return groundings
 
 
-def _slots_of_labels(
-    masks_KHW: Bools, truth_HW: Integers, labels: Sequence[int]
-) -> dict[int, tuple[int, ...]]:
+def _slots_of_labels(masks_KHW: Bools, truth_HW: Integers, labels: Sequence[int]) -> dict[int, tuple[int, ...]]:
     true_NHW = np.stack([truth_HW == label for label in labels])
     overlap_KN = np.einsum("khw,nhw->kn", masks_KHW.astype(np.float32), true_NHW.astype(np.float32))
     union_KN = masks_KHW.sum((1, 2))[:, None] + true_NHW.sum((1, 2)) - overlap_KN

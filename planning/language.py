@@ -45,9 +45,7 @@ class Instruction:
             raise ValueError(f"no relation {self.relation!r}; there are: {', '.join(RELATIONS)}")
         kinds = RELATIONS[self.relation].kinds
         if (self.thing.kind, self.target.kind) != kinds:
-            raise ValueError(
-                f"{self.relation!r} joins {' and '.join(kinds)}, not {self.thing} and {self.target}"
-            )
+            raise ValueError(f"{self.relation!r} joins {' and '.join(kinds)}, not {self.thing} and {self.target}")
         if self.thing == self.target:
             raise ValueError(f"the {self.thing} cannot be {self.relation} itself")
         if self.thing.color == self.target.color:
@@ -143,8 +141,7 @@ def _parse(text: str) -> tuple[Instruction, ...]:
         for name, relation in RELATIONS.items():
             if match := re.match(rf"{first}{relation.pattern.pattern}(?: |$)", words):
                 things = (
-                    Thing(match[role], kind)
-                    for role, kind in zip(("thing", "target"), relation.kinds, strict=True)
+                    Thing(match[role], kind) for role, kind in zip(("thing", "target"), relation.kinds, strict=True)
                 )
                 found.append(Instruction(name, *things))
                 words = words[match.end() :]

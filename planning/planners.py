@@ -14,15 +14,7 @@ from numpy.typing import NDArray
 from .grounding import Grounder, Grounding, GroundingError
 from .language import AnyGoal, Goal, Instruction
 from .relations import RELATIONS
-from .scores import (
-    DEFAULT_CRITERION,
-    DEFAULT_SCORE,
-    Score,
-    SuccessCriterion,
-    Trace,
-    measure_rollout,
-    unmet,
-)
+from .scores import DEFAULT_CRITERION, DEFAULT_SCORE, Score, SuccessCriterion, Trace, measure_rollout, unmet
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -181,11 +173,6 @@ class BeamPlanner(_LooksAtMasks):
         if count < len(traces):
             scores_Bn = [sorted(scores_n, reverse=True)[:count] for scores_n in scores_Bn]
         return [sum(scores_n) / count for scores_n in scores_Bn]
-
-
-InstructionPlanner = (
-    BeamPlanner  # what the planner of goals of one instruction was called when it stood alone
-)
 
 
 @dataclass

@@ -40,9 +40,7 @@ class Relation:
 
     def distance(self, thing_NHW: Tensor, target_NHW: Tensor, view: View = CLOSE_VIEW) -> Tensor:
         """How far bool masks (..., H, W) are from it: (...) in pixels; inf where a mask is empty."""
-        return self.distance_of_places(centroids(thing_NHW), centroids(target_NHW), view).nan_to_num(
-            nan=UNSEEN
-        )
+        return self.distance_of_places(centroids(thing_NHW), centroids(target_NHW), view).nan_to_num(nan=UNSEEN)
 
     def distance_of_places(self, thing_N2: Tensor, target_N2: Tensor, view: View = CLOSE_VIEW) -> Tensor:
         """The same of places (..., 2) in pixels of the view."""

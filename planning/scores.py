@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
 def holds(masks_KHW: Bools, grounding: Grounding, instruction: Instruction) -> bool:
     """Whether bool masks (K, H, W) show what an instruction asks for; a GroundingError if its things are not seen."""
-    thing_HW, target_HW = (
-        np.any(masks_KHW[list(grounding.slots_of(one))], axis=0) for one in instruction.things
-    )
+    thing_HW, target_HW = (np.any(masks_KHW[list(grounding.slots_of(one))], axis=0) for one in instruction.things)
     return RELATIONS[instruction.relation].shown(thing_HW, target_HW, grounding.view)
 
 
@@ -225,9 +223,7 @@ class WeightedSum:
 
     def __post_init__(self) -> None:
         if len(self.scores) != len(self.weights) or sum(self.weights) <= 0:
-            raise ValueError(
-                f"{len(self.scores)} scores need as many weights with a positive sum: {self.weights}"
-            )
+            raise ValueError(f"{len(self.scores)} scores need as many weights with a positive sum: {self.weights}")
 
     def __call__(self, trace: Trace) -> Tensor:
         parts = [weight * score(trace) for score, weight in zip(self.scores, self.weights, strict=True)]

@@ -261,9 +261,7 @@ class SearchPlanner:
             return False
         return bool((wanted.ratios(places(parsed, grounding, sorted(grounding.things))) <= 1).all())
 
-    def look(
-        self, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder
-    ) -> tuple[Rollout, Grounding, Wanted]:
+    def look(self, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder) -> tuple[Rollout, Grounding, Wanted]:
         """What a picture (H, W, 3) shows, and what is wanted of it; a GroundingError where the two do not fit."""
         parsed, grounding = observe(self.world_model, rgb, goal, grounder, self.seed)
         things = sorted(grounding.things)

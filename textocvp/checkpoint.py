@@ -82,9 +82,7 @@ def resolve_checkpoint(name: str | Path, **hub: Any) -> Iterator[Path]:
     if name.count("/") != 1 or name.startswith((".", "/", "~")):
         raise CheckpointError(f"unknown checkpoint {name!r}. {allowed}")
     try:
-        fetched = snapshot_download(
-            name, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"], **hub
-        )
+        fetched = snapshot_download(name, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, f"{TEXT_FOLDER}/*"], **hub)
     # The hub client raises many kinds: no such repository, no network, not a valid id, no access.
     except Exception as error:
         raise CheckpointError(

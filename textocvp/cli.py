@@ -32,14 +32,13 @@ from textocvp.checkpoint import (
     write_config,
 )
 from textocvp.config import ModelConfig, with_settings
-from textocvp.drawing import SUFFIXES
 from textocvp.files import replacing
 from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
 from textocvp.model import TextOCVP
 from textocvp.parsers.dino import DINO_HUB_ID
 from textocvp.parsers.efficientnet import LITE0
-from textocvp.pictures import read_picture
+from textocvp.pictures import SUFFIXES, read_picture
 from textocvp.presets import DESCRIPTIONS, PRESETS, preset
 from textocvp.pretrained import WeightsError
 from textocvp.protocols import load_model
@@ -328,18 +327,12 @@ def _data(arguments: list[str]) -> int:
         if isinstance(action, ImportCommand):
             how: dict[str, Any] = {"size": action.size, "crop": action.crop, "every": action.every}
             if exchange.kind_of(action.source) == "videos":
-                done = own_videos.import_videos(
-                    action.source, action.out, **how | {"size": action.size or 64}
-                )
+                done = own_videos.import_videos(action.source, action.out, **how | {"size": action.size or 64})
             else:
                 done = exchange.import_set(action.source, action.out, **how, camera=action.camera)
             for line in done.left_out:
                 print(f"left out: {line}", file=sys.stderr)
-            print(
-                "\n".join(
-                    [*done.lines, f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames"]
-                )
-            )
+            print("\n".join([*done.lines, f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames"]))
             return 0
         if not action.file.exists():
             raise Mistake(f"there is no file or folder {action.file} (looked for in {Path.cwd()})")
@@ -391,13 +384,9 @@ def _rollout(command: RolloutCommand) -> None:
     texts = (command.text, *command.more_texts)
     if len(texts) > 1 and not any(" " in text for text in texts):
         texts = (" ".join(texts),)
-        print(
-            f"took the words for one sentence, {texts[0]!r}; several sentences need quotes", file=sys.stderr
-        )
+        print(f"took the words for one sentence, {texts[0]!r}; several sentences need quotes", file=sys.stderr)
     try:
-        picture, done = read_picture(
-            command.image, world_model.image_size, resize=command.resize, crop=command.crop
-        )
+        picture, done = read_picture(command.image, world_model.image_size, resize=command.resize, crop=command.crop)
     except FileNotFoundError:
         raise Mistake(f"there is no picture {command.image}") from None
     except (UnidentifiedImageError, OSError) as error:
@@ -534,8 +523,7 @@ def _listed(name: str, config: Any, bundled: bool) -> ListedModel:
         needed.append(config.text.weights or default)
     weights = "; ".join([*needed, "in this package" if bundled else weights])
     counts = [
-        sum(p.numel() for part in some for p in part.parameters() if p.requires_grad)
-        for some in (parts, predictor)
+        sum(p.numel() for part in some for p in part.parameters() if p.requires_grad) for some in (parts, predictor)
     ]
     state: Any = "trained here" if bundled else "needs weights" if needed else "not trained here"
     return ListedModel(name, DESCRIPTIONS.get(name, ""), counts[0], counts[1], state, weights)

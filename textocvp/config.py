@@ -80,9 +80,7 @@ def build(cls: type[C], data: Any, path: str = "") -> C:
     hints, kinds = get_type_hints(cls), getattr(cls, "KINDS", {})
     for name in data:
         if name not in known:
-            raise ValueError(
-                f"{path or 'the configuration'} has no field {name!r}; known: {', '.join(known)}"
-            )
+            raise ValueError(f"{path or 'the configuration'} has no field {name!r}; known: {', '.join(known)}")
     values: dict[str, Any] = {}
     for name, one in known.items():
         where = f"{path}.{name}" if path else name

@@ -29,9 +29,7 @@ def crop(images: Tensor, position: Tensor, scale: Tensor, cells: int, extent: fl
     return rows[:, :, None] @ images @ columns[:, :, None].transpose(-1, -2)
 
 
-def paste(
-    pictures: Tensor, position: Tensor, scale: Tensor, height: int, width: int, extent: float
-) -> Tensor:
+def paste(pictures: Tensor, position: Tensor, scale: Tensor, height: int, width: int, extent: float) -> Tensor:
     """Paste canonical pictures (B, K, C, cells, cells) into images (B, K, C, height, width) of zeros; see `crop`."""
     cells = pictures.shape[-1]
     rows = _paste_weights(position[..., 1], scale[..., 1], height, cells, extent)

@@ -76,9 +76,7 @@ def observed_images(obs: Mapping[str, Any] | np.ndarray) -> np.ndarray:
     if images.ndim == 3:
         images = images[None]
     if images.ndim != 4:
-        raise ValueError(
-            f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}"
-        )
+        raise ValueError(f"the observation must be an image (H, W, 3) or images (B, H, W, 3), not {images.shape}")
     return images
 
 
@@ -124,35 +122,24 @@ def checked_frames(
         hint = "; of 16 bits make 8: (image // 257).astype(np.uint8)" if images.dtype == np.uint16 else hint
         raise TypeError(f"{what} must be uint8 RGB with values 0..255, not {images.dtype}{hint}")
     if images.shape[-1] != 3 or images.shape[0] == 0:
-        raise ValueError(
-            f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}"
-        )
+        raise ValueError(f"{what} must be RGB with the three colours last, (..., {H}, {W}, 3), not {images.shape}")
     times = times_larger(images.shape[1:3], image_size)
     if times == 0 or (times > 1 and not multiples):
         allowed = (
-            f"it takes that and whole multiples of it, such as {2 * H}x{2 * W}"
-            if multiples
-            else "it takes no other"
+            f"it takes that and whole multiples of it, such as {2 * H}x{2 * W}" if multiples else "it takes no other"
         )
         raise ValueError(
             f"{what} is {images.shape[1]}x{images.shape[2]} pixels; this model was trained on {H}x{W}, {allowed}: "
             "render or resize to that"
         )
     if images.max() == 1:
-        raise ValueError(
-            f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255"
-        )
+        raise ValueError(f"{what} has only the values 0 and 1: a 0..1 picture was cast to uint8 without * 255")
     frames_NHW3 = torch.from_numpy(np.array(images)).to(device)
     return frames_NHW3.permute(0, 3, 1, 2).float() / 127.5 - 1
 
 
 def warn_of_foreign(
-    frames_B3HW: Tensor,
-    psnr_B: Tensor,
-    own: OwnFrames,
-    psnr_of: Callable[[Tensor], Tensor],
-    *,
-    depth: int,
+    frames_B3HW: Tensor, psnr_B: Tensor, own: OwnFrames, psnr_of: Callable[[Tensor], Tensor], *, depth: int
 ) -> None:
     """A `ForeignPictureWarning`, with the likely cause, for the first picture that is not of the model's world.
 
@@ -211,9 +198,7 @@ def hue_shares(values_B3HW: Tensor, hues_C3: Tensor) -> Tensor:
     return (off_BCHW <= HUE_REACH).float().mean((2, 3))
 
 
-def _upside_down(
-    frame_13HW: Tensor, psnr: Tensor, own: OwnFrames, psnr_of: Callable[[Tensor], Tensor]
-) -> bool:
+def _upside_down(frame_13HW: Tensor, psnr: Tensor, own: OwnFrames, psnr_of: Callable[[Tensor], Tensor]) -> bool:
     """Whether a picture that is redrawn badly is redrawn as usual when it is turned."""
     turned = psnr_of(frame_13HW.flip(2))[0]
     return bool((turned >= psnr + UPSIDE_DOWN_DB) & (turned >= own.psnr_low - FOREIGN_DB))
@@ -266,13 +251,7 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
 
 
 def warn_of_absent(
-    slots_BKD: Tensor,
-    layout: SlotLayout,
-    words: WordBatch,
-    texts: Sequence[str],
-    encoder: TextEncoder,
-    *,
-    depth: int,
+    slots_BKD: Tensor, layout: SlotLayout, words: WordBatch, texts: Sequence[str], encoder: TextEncoder, *, depth: int
 ) -> None:
     """A `UserWarning` that names the first colour that no slot has, and the nearest ones that some have.
 
@@ -317,9 +296,7 @@ def checked_horizon(horizon: int, longest: int | None, hint: str = "") -> None:
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(f"horizon must be a whole number of at least 1 frame, not {horizon!r}")
     if longest is not None and horizon > longest:
-        raise ValueError(
-            f"horizon {horizon} is longer than this model was trained for: at most {longest}{hint}"
-        )
+        raise ValueError(f"horizon {horizon} is longer than this model was trained for: at most {longest}{hint}")
 
 
 def checked_pairs(scenes: int, sentences: int) -> int:

@@ -82,11 +82,7 @@ class SelfAttention(nn.Module):
         self.out = nn.Linear(dim, dim, bias=False)
 
     def forward(
-        self,
-        x_BMC: Tensor,
-        bias: Tensor | None,
-        newest: int | None = None,
-        cache: KeyValueCache | None = None,
+        self, x_BMC: Tensor, bias: Tensor | None, newest: int | None = None, cache: KeyValueCache | None = None
     ) -> Tensor:
         """(B, N, C): the last N = `newest` tokens (default: all) attend to all tokens and to those in the cache."""
         dim = x_BMC.shape[-1]
@@ -123,9 +119,7 @@ class TextAttention(nn.Module):
         k_BLC, v_BLC = self.kv(self.norm_text(text_BLC)).chunk(2, dim=-1)
         return split_heads(k_BLC, self.heads), split_heads(v_BLC, self.heads)
 
-    def forward(
-        self, x_BNC: Tensor, keys_values: tuple[Tensor, Tensor], bias: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, x_BNC: Tensor, keys_values: tuple[Tensor, Tensor], bias: Tensor) -> tuple[Tensor, Tensor]:
         """The text's update of each token (B, N, C), and the attention (B, h, N, L)."""
         values_BhNd, weights_BhNL = attend(split_heads(self.q(x_BNC), self.heads), *keys_values, bias)
         return self.out(join_heads(values_BhNd)), weights_BhNL

@@ -36,10 +36,7 @@ from textocvp.text import build_text_encoder
 
 
 class TextOCVP(
-    nn.Module,
-    PyTorchModelHubMixin,
-    library_name="textocvp",
-    tags=["world-model", "object-centric", "video-prediction"],
+    nn.Module, PyTorchModelHubMixin, library_name="textocvp", tags=["world-model", "object-centric", "video-prediction"]
 ):
     """The text-conditioned object-centric video predictor: `parser`, `text`, `predictor`, `renderer`.
 
@@ -119,13 +116,9 @@ def check_parts(config: ModelConfig) -> None:
         raise ValueError("renderer.kind 'carry' needs to know which slot is the robot: set parser.kind=votes")
     if isinstance(renderer, UpsampleConfig):
         if layout.explicit or parser.num_slots != 1:
-            raise ValueError(
-                "renderer.kind 'upsample' draws the one slot of a frame: set parser.kind=holistic"
-            )
+            raise ValueError("renderer.kind 'upsample' draws the one slot of a frame: set parser.kind=holistic")
         if side < 16 or side & (side - 1):
-            raise ValueError(
-                f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {side}"
-            )
+            raise ValueError(f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {side}")
     if isinstance(renderer, PatchConfig) and side % renderer.patches:
         raise ValueError(f"renderer.patches: {renderer.patches} patches do not divide {side} pixels evenly")
     if isinstance(renderer, FeatureConfig):

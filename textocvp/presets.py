@@ -66,92 +66,37 @@ PUBLISHED_SAVI = SaviConfig(
     transition_hidden=512,
 )
 
-TABLETOP_SMALL = ModelConfig(
-    name="tabletop-small",
-    parser=PlacedConfig(),
-    renderer=GlimpseConfig(),
-    text=SMALL_TEXT,
-    predictor=replace(SMALL, color_bias=True),
-)
-SAVI_SMALL = ModelConfig(
-    name="savi-small",
-    parser=SaviConfig(encoder_stride=2, iterations_first=3),
-    renderer=PatchConfig(hidden=64, mask_prior=True),
-    text=SMALL_TEXT,
-    predictor=SMALL,
-)
-SAVI_CATER = ModelConfig(
-    name="savi-cater",
-    parser=PUBLISHED_SAVI,
-    renderer=BroadcastConfig(),
-    text=PUBLISHED_TEXT,
-    predictor=PUBLISHED,
-)
 PUBLISHED_DINO = replace(PUBLISHED_SAVI, image_size=336, num_slots=10, encoder="dinov2")
-# CLIPort at 336x336: 24x24 patches.
-CLIPORT_DINO = ModelConfig(
-    name="cliport-dino",
-    parser=PUBLISHED_DINO,
-    renderer=FeatureConfig(hidden=1024, patches=24),
-    text=PUBLISHED_TEXT,
-    predictor=PUBLISHED,
-)
-# The same with an encoder that is a Python package, at a size that one core trains. Blocks are 10 to 20 pixels wide:
-# cut into 42x42 places their true masks keep an IoU of .83, into 21x21 .50.
-CLIPORT_LITE0 = ModelConfig(
-    name="cliport-lite0",
-    parser=replace(PUBLISHED_DINO, encoder="efficientnet-lite0", encoder_dim=40, encoder_patch=8),
-    renderer=FeatureConfig(patches=42, feature_dim=40, image_channels=64),
-    text=SMALL_TEXT,
-    predictor=replace(SMALL, window=56),
-)
-NON_OC_SMALL = ModelConfig(
-    name="non-oc-small",
-    parser=HolisticConfig(pool_cells=4),
-    renderer=UpsampleConfig(),
-    text=SMALL_TEXT,
-    predictor=replace(SMALL, standardize=True),
-)
-NON_OC = ModelConfig(
-    name="non-oc",
-    parser=HolisticConfig(layout=SlotLayout(content=512, explicit=False), encoder_channels=64),
-    renderer=UpsampleConfig(channels=64),
-    text=PUBLISHED_TEXT,
-    predictor=PUBLISHED,
-)
-# CLIPort's scene on CPUs: slots from half its size, and whole episodes, which have up to 57 frames.
-CLIPORT = ModelConfig(
-    name="cliport",
-    parser=VotesConfig(image_size=168, num_slots=12),
-    renderer=CarryConfig(),
-    text=SMALL_TEXT,
-    predictor=replace(SMALL, color_bias=True, window=56),
-)
-# CATER-hard on CPUs: background, a place for a robot that is not there, at most 8 things, and one to spare.
-CATER = ModelConfig(
-    name="cater",
-    parser=VotesConfig(num_slots=11, peak_radius=3.0, memory=False),
-    renderer=RecallConfig(),
-    text=WordsConfig(kind="transformer"),
-    predictor=replace(SMALL, window=29, appearance=True),
-)
-OCVP_SEQ_SMALL = replace(TABLETOP_SMALL, name="ocvp-seq-small", predictor=SMALL_SEQ)
-OCVP_SEQ = replace(SAVI_CATER, name="ocvp-seq", predictor=PUBLISHED_SEQ)
 
-_ALL = (
-    TABLETOP_SMALL,
-    SAVI_SMALL,
-    SAVI_CATER,
-    CLIPORT_DINO,
-    CLIPORT_LITE0,
-    CLIPORT,
-    CATER,
-    OCVP_SEQ_SMALL,
-    OCVP_SEQ,
-    NON_OC_SMALL,
-    NON_OC,
-)
-PRESETS = {one.name: one for one in _ALL}
+PRESETS = {
+    one.name: one
+    for one in (  # name, parser, renderer, text, predictor
+        ModelConfig("tabletop-small", PlacedConfig(), GlimpseConfig(), SMALL_TEXT, replace(SMALL, color_bias=True)),
+        ModelConfig("savi-small", SaviConfig(encoder_stride=2, iterations_first=3),
+                    PatchConfig(hidden=64, mask_prior=True), SMALL_TEXT, SMALL),
+        ModelConfig("savi-cater", PUBLISHED_SAVI, BroadcastConfig(), PUBLISHED_TEXT, PUBLISHED),
+        # CLIPort at 336x336: 24x24 patches.
+        ModelConfig("cliport-dino", PUBLISHED_DINO, FeatureConfig(hidden=1024, patches=24), PUBLISHED_TEXT, PUBLISHED),
+        # The same with an encoder that is a Python package, at a size that one core trains. Blocks are 10 to 20 pixels
+        # wide: cut into 42x42 places their true masks keep an IoU of .83, into 21x21 .50.
+        ModelConfig("cliport-lite0",
+                    replace(PUBLISHED_DINO, encoder="efficientnet-lite0", encoder_dim=40, encoder_patch=8),
+                    FeatureConfig(patches=42, feature_dim=40, image_channels=64), SMALL_TEXT,
+                    replace(SMALL, window=56)),
+        # CLIPort's scene on CPUs: slots from half its size, and whole episodes, which have up to 57 frames.
+        ModelConfig("cliport", VotesConfig(image_size=168, num_slots=12), CarryConfig(), SMALL_TEXT,
+                    replace(SMALL, color_bias=True, window=56)),
+        # CATER-hard on CPUs: background, a place for a robot that is not there, at most 8 things, and one to spare.
+        ModelConfig("cater", VotesConfig(num_slots=11, peak_radius=3.0, memory=False), RecallConfig(),
+                    WordsConfig(kind="transformer"), replace(SMALL, window=29, appearance=True)),
+        ModelConfig("ocvp-seq-small", PlacedConfig(), GlimpseConfig(), SMALL_TEXT, SMALL_SEQ),
+        ModelConfig("ocvp-seq", PUBLISHED_SAVI, BroadcastConfig(), PUBLISHED_TEXT, PUBLISHED_SEQ),
+        ModelConfig("non-oc-small", HolisticConfig(pool_cells=4), UpsampleConfig(), SMALL_TEXT,
+                    replace(SMALL, standardize=True)),
+        ModelConfig("non-oc", HolisticConfig(layout=SlotLayout(content=512, explicit=False), encoder_channels=64),
+                    UpsampleConfig(channels=64), PUBLISHED_TEXT, PUBLISHED),
+    )
+}  # fmt: skip
 
 # What `textocvp models` says of each preset and bundled checkpoint.
 DESCRIPTIONS = {

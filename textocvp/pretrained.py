@@ -114,9 +114,7 @@ def read_model(kind: type[M], folder: Path, **options: Any) -> M:
         name = min(report["missing_keys"])
         raise WeightsError(f"{path} lacks the tensor {name!r} {tuple(model.state_dict()[name].shape)}")
     if report["mismatched_keys"]:
-        name = min(
-            key if isinstance(key, str) else key[0] for key in report["mismatched_keys"]
-        )  # transformers 4, 5
+        name = min(key if isinstance(key, str) else key[0] for key in report["mismatched_keys"])  # transformers 4, 5
         wanted = tuple(model.state_dict()[name].shape)
         raise WeightsError(f"{path} has in another shape the tensor {name!r} {wanted}")
     return model.float()

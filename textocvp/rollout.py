@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from textocvp.drawing import save_film
 from textocvp.layers import pixel_grid
+from textocvp.pictures import save_film
 from textocvp.renderers.base import Rendered, Renderer, Seen
 from textocvp.slots import SlotLayout, SlotState
 
@@ -48,8 +48,7 @@ class Rollout:
     image_size: tuple[int, int]  # (H, W) in pixels
     layout: SlotLayout  # what the D numbers of a slot mean
     renderer: Renderer  # draws the slots
-    # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for.
-    attention: Tensor | None = None
+    attention: Tensor | None = None  # (B, T - 1, layers, heads, K, words) from slots to words, if it was asked for
     # What the renderer keeps of each sequence's first frame, which may be that of an earlier rollout.
     seen: tuple[Seen, ...] | None = None
     _decoded: _Decoded = field(default_factory=_Decoded)
@@ -208,9 +207,7 @@ class Rollout:
         Raises:
             IndexError: if there is no such sequence.
         """
-        keep = _numbers(
-            len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index]
-        )
+        keep = _numbers(len(self), index if isinstance(index, slice | Sequence) or np.ndim(index) else [index])
         decoded = self._decoded
         kept = ({t: drawn[keep] for t, drawn in kind.items()} for kind in (decoded.masks, decoded.frames))
         return replace(

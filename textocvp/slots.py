@@ -30,8 +30,7 @@ class SlotLayout:
     """How the last axis of a slot tensor is divided: `[content | colour 3 | position 2 | scale 2 | presence 1]`."""
 
     content: int  # number of learned channels, which have no fixed meaning
-    # Whether the 8 explicit channels follow; in the published form they do not: D = content.
-    explicit: bool = True
+    explicit: bool = True  # whether the 8 explicit channels follow; in the published form they do not: D = content
 
     @property
     def dim(self) -> int:
@@ -82,9 +81,7 @@ class SlotState:
             ValueError: if the layout has no explicit channels, or its width is not D.
         """
         if not layout.explicit:
-            raise ValueError(
-                "these slots have no explicit colour, position or scale (layout.explicit is False)"
-            )
+            raise ValueError("these slots have no explicit colour, position or scale (layout.explicit is False)")
         if slots.shape[-1] != layout.dim:
             raise ValueError(f"slots are {slots.shape[-1]} wide, the layout says {layout.dim}")
         content, color, position, scale, presence = slots.split([layout.content, 3, 2, 2, 1], dim=-1)

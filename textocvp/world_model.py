@@ -252,15 +252,11 @@ class WorldModel:
             size = (seen[0].frame_3HW.shape[-2], seen[0].frame_3HW.shape[-1])
         return Rollout(slots_BTKD, (), size, model.parser.layout, model.renderer, seen=seen)
 
-    def _start(
-        self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int, num_slots: int | None
-    ) -> Rollout:
+    def _start(self, obs: Mapping[str, Any] | np.ndarray | Rollout, seed: int, num_slots: int | None) -> Rollout:
         if isinstance(obs, Rollout):
             own = obs.slots.shape[2]
             if num_slots not in (None, own):
-                raise ValueError(
-                    f"this rollout goes on with its own {own} slots; num_slots={num_slots} is for images"
-                )
+                raise ValueError(f"this rollout goes on with its own {own} slots; num_slots={num_slots} is for images")
             larger = obs.seen is not None and times_larger(obs.image_size, self.image_size) > 0
             if obs.layout != self.model.parser.layout or not (larger or obs.image_size == self.image_size):
                 raise ValueError(

@@ -153,9 +153,7 @@ def arm_urdf(arm: Arm) -> str:
 def _link(name: str, mass: float, shapes: str) -> str:
     inertia = mass * 0.01
     tensor = f'ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"'
-    return (
-        f'<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial>{shapes}</link>'
-    )
+    return f'<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial>{shapes}</link>'
 
 
 def _cylinder(radius: float, length: float, center: Point, along: str = "z") -> str:

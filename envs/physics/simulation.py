@@ -108,10 +108,7 @@ class Tabletop:
         bullet.resetSimulation()
         # resetSimulation keeps some parameters and resets others, so all are set each time.
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=1 / self.physics_hz,
-            numSubSteps=0,
-            numSolverIterations=50,
-            deterministicOverlappingPairs=1,
+            fixedTimeStep=1 / self.physics_hz, numSubSteps=0, numSolverIterations=50, deterministicOverlappingPairs=1
         )
         bullet.setGravity(0, 0, GRAVITY)
         self.table = self._add_table()
@@ -209,11 +206,7 @@ class Tabletop:
             rgba = _rgba(self.setup.object_rgb(index, item.color))
             shape, mass, z = p.GEOM_MESH, BOWL_MASS, 0.0
             if item.kind == "block":
-                z = (
-                    _floor(scene.objects, item, sizes) + sizes.block / 2
-                    if item.height is None
-                    else item.height
-                )
+                z = _floor(scene.objects, item, sizes) + sizes.block / 2 if item.height is None else item.height
                 shape, mass = p.GEOM_BOX, BLOCK_MASS
             look = bullet.createVisualShape(shape, rgbaColor=rgba, **looks[item.kind])
             turn = p.getQuaternionFromEuler([0.0, 0.0, item.yaw])

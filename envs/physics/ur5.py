@@ -17,9 +17,7 @@ from .shapes import generated_file
 PACKAGE = "example-robot-data"
 FOLDER = "cmeel.prefix/share/example-robot-data/robots/ur_description/meshes/ur5/collision"
 
-CREASE = radians(
-    40.0
-)  # faces that meet at a larger angle keep an edge; others are shaded as one round surface
+CREASE = radians(40.0)  # faces that meet at a larger angle keep an edge; others are shaded as one round surface
 
 _BACK = np.diag([-1.0, -1.0, 1.0])
 _ALONG = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])

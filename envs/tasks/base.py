@@ -75,13 +75,7 @@ class Task:
     pairs: tuple[int, int] = (1, 1)  # fewest and most of a random goal; a given instruction has 1 to the most
     attempts: int = 3  # pick-and-places until an episode is truncated, for each pair of a random goal
     stacks: bool = False  # whether blocks may start on each other, and pictures may be goals
-    scene_options: tuple[str, ...] = (
-        "n_objects",
-        "n_bowls",
-        "color_split",
-        "blocks_in_bowls",
-        "target_in_bowl",
-    )
+    scene_options: tuple[str, ...] = ("n_objects", "n_bowls", "color_split", "blocks_in_bowls", "target_in_bowl")
     """Reset options that describe a random scene, or its goal."""
 
     @property
@@ -145,9 +139,7 @@ class Task:
             targets = [step.target for step in instructions if step.relation == relation.name]
             if relation.exclusive and len(set(targets)) < len(targets):
                 thing, target = relation.kinds
-                raise ValueError(
-                    f"an instruction must not name a {target} twice: a {target} has room for one {thing}"
-                )
+                raise ValueError(f"an instruction must not name a {target} twice: a {target} has room for one {thing}")
 
     def relation(self, step: GoalPair | Instruction) -> Relation:
         """The relation that a goal pair or an instruction names."""
@@ -214,9 +206,7 @@ class Task:
     def fulfilled_at_start(self, scene: Scene) -> bool:
         """Whether a layout is already as its goal says."""
         layout = scene.objects
-        return all(
-            self.relation(pair).fulfilled_at_start(layout, pair.thing, pair.target) for pair in scene.goal
-        )
+        return all(self.relation(pair).fulfilled_at_start(layout, pair.thing, pair.target) for pair in scene.goal)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a layout with a goal that it already fulfils, or that it cannot reach."""

@@ -122,9 +122,7 @@ class Rearrange(Task):
 
     # -- What sentences lead to ----------------------------------------------------------------------------
 
-    def solve(
-        self, scene: Scene, start: Supports, surprises: Surprises | None = None
-    ) -> tuple[GoalPair, ...] | None:
+    def solve(self, scene: Scene, start: Supports, surprises: Surprises | None = None) -> tuple[GoalPair, ...] | None:
         """The fewest sentences that should lead from ``start`` to the scene's goal, by the rule of `outcome`.
 
         ``surprises`` overrule it. None when `MAX_STATES` arrangements show no way.

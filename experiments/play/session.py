@@ -35,9 +35,8 @@ from planning import (
 from planning.controller import RESTING_HEIGHTS
 from planning.search import HORIZON
 from textocvp import Rollout, WorldModel
-from textocvp.drawing import SUFFIXES, save_film
 from textocvp.film_page import film_data, picture_url, save_page
-from textocvp.pictures import read_picture
+from textocvp.pictures import SUFFIXES, read_picture, save_film
 
 MOST_SENTENCES = 12  # side by side
 

@@ -32,9 +32,7 @@ def segmentation_colors(objects: int) -> np.ndarray:
     return np.concatenate([BACKGROUND[None], ARM[None], things])
 
 
-def slot_colors(
-    slot_labels_HW: np.ndarray, segmentation_HW: np.ndarray, slots: int, objects: int
-) -> np.ndarray:
+def slot_colors(slot_labels_HW: np.ndarray, segmentation_HW: np.ndarray, slots: int, objects: int) -> np.ndarray:
     """Colours (slots, 3) that make each slot look like the thing it covers most of in the first frame.
 
     Only for pictures: a slot that covers nothing of the simulator's segmentation well stays grey.
@@ -52,12 +50,7 @@ def slot_colors(
 
 
 def gif(
-    grid: Sequence[Sequence[np.ndarray]],
-    *,
-    seconds_a_frame: float = 0.14,
-    scale: int = 2,
-    hold: int = 6,
-    gap: int = 2,
+    grid: Sequence[Sequence[np.ndarray]], *, seconds_a_frame: float = 0.14, scale: int = 2, hold: int = 6, gap: int = 2
 ) -> bytes:
     """A grid of panels, rows of (T,H,W,3) uint8, as a GIF that loops.
 
@@ -82,9 +75,7 @@ def gif(
     ]
     shown, buffer = int(seconds_a_frame * 1000), io.BytesIO()
     durations = [shown] * (length - 1) + [shown * hold]
-    images[0].save(
-        buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False
-    )
+    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
     return buffer.getvalue()
 
 

@@ -176,9 +176,7 @@ def curve_plot(
         if len(curves) <= 3:
             axes.legend()
         else:  # there is no room for it among so many curves
-            axes.legend(
-                loc="lower center", ncols=4, bbox_to_anchor=(0.5, 1.0), handlelength=1.2, columnspacing=1.2
-            )
+            axes.legend(loc="lower center", ncols=4, bbox_to_anchor=(0.5, 1.0), handlelength=1.2, columnspacing=1.2)
 
     alt = f"{label} over {across}: " + ", ".join(title for title, _ in curves)
     return _figure(name, draw, (NARROW, 3.4), alt, caption)

@@ -61,9 +61,7 @@ class Estimate:
         declared = sum(part.timed * part.declared for part in parts)
         scale = (sum(part.seconds for part in parts) + TRUST_SECONDS) / (declared + TRUST_SECONDS)
         return sum(
-            (part.total - part.done)
-            * (TRUST_UNITS * part.declared * scale + part.seconds)
-            / (TRUST_UNITS + part.timed)
+            (part.total - part.done) * (TRUST_UNITS * part.declared * scale + part.seconds) / (TRUST_UNITS + part.timed)
             for part in parts
         )
 

@@ -47,8 +47,7 @@ class Results:
     versions: Mapping[str, str]  # package name -> version; also the hashes of other weights
     seeds: Mapping[str, Sequence[int]]  # every seed used, in groups: name -> seeds
     quick: bool  # whether this was only the short first look
-    # how long it took. The only field that differs when a study is repeated with the same seed.
-    seconds: float
+    seconds: float  # how long it took. The only field that differs when a study is repeated with the same seed.
     rows: Sequence[Row]  # the figures
     # the few figures that a reader wants first, name -> number
     headline: Mapping[str, float] = field(default_factory=dict)

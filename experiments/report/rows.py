@@ -11,8 +11,7 @@ import numpy as np
 
 from textocvp.metrics.intervals import Interval, bootstrap_interval, wilson_interval
 
-Key = tuple[str, str, str, str]
-"""(method, split, variant, metric): what names a row."""
+Key = tuple[str, str, str, str]  # (method, split, variant, metric): what names a row
 
 
 @dataclass(frozen=True)
@@ -102,6 +101,4 @@ def figure_rows(scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]]
     for split, figures in scenes:
         for (method, variant, metric), value in figures.items():
             values.setdefault((method, split, variant, metric), []).append(value)
-    return [
-        (rate_row if np.asarray(its).dtype == bool else mean_row)(*key, its) for key, its in values.items()
-    ]
+    return [(rate_row if np.asarray(its).dtype == bool else mean_row)(*key, its) for key, its in values.items()]

@@ -83,9 +83,7 @@ class Table:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row.cells) != len(self.columns):
-                raise ValueError(
-                    f"row {row.label!r} has {len(row.cells)} cells, the table {len(self.columns)} columns"
-                )
+                raise ValueError(f"row {row.label!r} has {len(row.cells)} cells, the table {len(self.columns)} columns")
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -110,11 +108,9 @@ class Table:
         return used, [r for r in rows if any(there(r, c) for c in used)]
 
     def to_terminal(self, width: int = TERMINAL, intervals: bool = True) -> list[RichTable]:
-        """For the terminal. Columns for which a line is too narrow follow below, so that no figure is cut off.
+        """For a terminal that is `width` letters wide, `intervals` below the figures.
 
-        Args:
-            width: of the terminal, in letters.
-            intervals: whether they stand below the figures.
+        Columns for which a line is too narrow follow below, so that no figure is cut off.
         """
         used = self.measured()[0] or list(range(len(self.columns)))
         label = min(LABEL, max((len(row.label) for row in self.rows), default=1))
@@ -128,9 +124,7 @@ class Table:
             blocks[-1].append(c)
         tables = []
         for some in blocks:
-            table = RichTable(
-                box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left", title_style="bold"
-            )
+            table = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left", title_style="bold")
             table.title = self.title if some is blocks[0] else None
             table.caption, table.caption_justify, table.caption_style = None, "left", "dim"
             if some is blocks[-1] and self.full_caption:
@@ -150,9 +144,7 @@ class Table:
         """Heading of a column, the letters that it needs, and its cells; titles may be wrapped between words."""
         counts = {n for row in self.rows if (n := row.cells[c].n)}
         alike = len(counts) == 1
-        small = [
-            row.cells[c].small(len(self.counts) > 1 and not alike) if intervals else () for row in self.rows
-        ]
+        small = [row.cells[c].small(len(self.counts) > 1 and not alike) if intervals else () for row in self.rows]
         heading = self.columns[c]
         letters = [*heading.split(), *(row.cells[c].text for row in self.rows)]
         letters += [text for texts in small for text in texts]
@@ -196,8 +188,7 @@ class Line:
     """What a line of a table shows."""
 
     key: str  # `method` of the rows that it shows
-    # `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures
-    kind: Kind = "ours"
+    kind: Kind = "ours"  # `ours`, a `baseline`, a `control` that must be low, a `ceiling`, or the `paper`'s own figures
     note: str = ""  # how it was measured, in a few words
     hue: int = 0  # colour in every plot, an index into the themes' series
     label: str = ""  # its name; the key if empty
@@ -244,12 +235,7 @@ class TableSpec:
     caption: str = ""  # a sentence below
 
     def table(self, rows: Iterable[Row], missing: Iterable[str] = ()) -> Table:
-        """The table, with a dash for what was not measured (yet).
-
-        Args:
-            rows: all rows of the study.
-            missing: methods that cannot be measured here; their lines say so.
-        """
+        """The table, with a dash for what was not measured (yet); lines of `missing` methods say so."""
         found, missing = by_key(rows), set(missing)
         lines = []
         for line in self.lines:
@@ -272,9 +258,7 @@ class TableSpec:
         """(value, low, high) of a line at each column, in percent where the column is; None without a row."""
         found = by_key(rows)
         return [
-            (c.scale * row.value, c.scale * row.low, c.scale * row.high)
-            if (row := found.get(_key(line, c)))
-            else None
+            (c.scale * row.value, c.scale * row.low, c.scale * row.high) if (row := found.get(_key(line, c))) else None
             for c in self.columns
         ]
 

@@ -157,9 +157,7 @@ def _did(who: int, way: Path, clip: Clip, ways: dict[int, Path], size: int) -> A
     share_T = np.linspace(0, 1, T)
     line_y = way.start[1] + share_T * (way.end[1] - way.start[1])
     up = float(np.nanmax(np.minimum(line_y, max(way.start[1], way.end[1])) - way.points_T2[:, 1]))
-    high, low = (
-        _camera(size).project(np.array([[*thing.place, z]]))[0] for z in (thing.height + LIFT, thing.height)
-    )
+    high, low = (_camera(size).project(np.array([[*thing.place, z]]))[0] for z in (thing.height + LIFT, thing.height))
     if up < LIFTED * (low[1] - high[1]):
         return "slide" if np.linalg.norm(way.end - way.start) > MOVED else "rotate"
     for k, other in enumerate(clip.things):

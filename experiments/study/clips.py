@@ -108,9 +108,7 @@ def episode_clips(
     """Up to `count` failures, of each column in turn, and then successes: `2 * count` in all. Longest goals come first.
 
     Args:
-        outcomes: of all methods.
         column_of: title of the column that an episode stands in.
-        count: of failures.
         methods: whose episodes are shown.
     """
     ours = [(column_of(o.episode), o) for o in outcomes if o.episode.method in methods]
@@ -123,9 +121,7 @@ def episode_clips(
     return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]
 
 
-def extreme_clips(
-    clips: Sequence[PredictionClip], badness: Sequence[float], count: int
-) -> list[PredictionClip]:
+def extreme_clips(clips: Sequence[PredictionClip], badness: Sequence[float], count: int) -> list[PredictionClip]:
     """The `count` best and then the `count` worst, each with its rank, most extreme first; none is both.
 
     Of an odd number of clips too few for all, the best have one more.

@@ -145,7 +145,4 @@ def planning_seconds(
     for o in outcomes:
         if o.planning_seconds is not None:
             seconds[o.episode.method][column_of(o.episode)].append(o.planning_seconds)
-    return {
-        method: {title: round(fmean(its), 3) for title, its in table.items()}
-        for method, table in seconds.items()
-    }
+    return {method: {title: round(fmean(its), 3) for title, its in table.items()} for method, table in seconds.items()}

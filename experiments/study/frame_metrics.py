@@ -67,9 +67,7 @@ class Measures:
         return " ".join(f"{METRICS[name]} is absent: {reason}." for name, reason in self.reasons)
 
 
-def available_measures(
-    jedi: str | None = None, jedi_lengths: tuple[int, ...] = (), without_jedi: str = ""
-) -> Measures:
+def available_measures(jedi: str | None = None, jedi_lengths: tuple[int, ...] = (), without_jedi: str = "") -> Measures:
     """What can be measured on this machine.
 
     Args:
@@ -105,10 +103,7 @@ class FrameScores:
 class Scorer:
     """Measures the predictions of one scene; what concerns the real frames is computed once.
 
-    Args:
-        real: (T + 1, 3, H, W) in 0..1, the first frame included.
-        measures: what.
-        upper: also without the bottom rows.
+    `real` are these (T + 1, 3, H, W) in 0..1, the first included; with `upper` also without the bottom rows.
     """
 
     def __init__(self, real: Tensor, measures: Measures, *, upper: bool) -> None:

@@ -28,13 +28,10 @@ class Verdicts:
     """One method on one scene, for its V instructions (original first) and S slot seeds."""
 
     success_SV: np.ndarray  # bool
-    # distance in pixels between block and bowl over the last frames; inf where one is not seen
-    miss_SV: np.ndarray
+    miss_SV: np.ndarray  # distance in pixels between block and bowl over the last frames; inf where one is not seen
 
 
-def find_things(
-    rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]
-) -> Grounding | None:
+def find_things(rollout: Rollout, ground: AppearanceGrounder, instructions: Sequence[Instruction]) -> Grounding | None:
     """Which slot is what, by appearance on the first frame, which all rollouts of a batch share; None if unclear."""
     try:
         grounding = ground(rollout.select(0))

@@ -23,12 +23,7 @@ ROOMS = ("envs", "experiments", "planning", "textocvp")
 
 
 class KeptWork:
-    """The file.
-
-    Args:
-        path: of the file.
-        identity: of the study that is run now.
-    """
+    """The file; `identity` is that of the study that is run now."""
 
     def __init__(self, path: Path, identity: str) -> None:
         self.path, self.seconds = path, 0.0

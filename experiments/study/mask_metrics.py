@@ -20,8 +20,7 @@ class MaskScores:
     # mean over the blocks and bowls that are seen; slots are matched to them afresh in every frame
     # (Hungarian), as in the paper
     iou: np.ndarray
-    # mean of the named block and the arm, the only things that move; matched as above, with the arm
-    moving: np.ndarray
+    moving: np.ndarray  # mean of the named block and the arm, the only things that move; matched as above, with the arm
     block: np.ndarray  # these two by themselves
     arm: np.ndarray
     still: np.ndarray  # as `iou`, without the named block

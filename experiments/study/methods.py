@@ -27,8 +27,10 @@ from planning import (
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
-HORIZON = 24
-"""Frames of an episode of the tabletop after the first one."""
+HORIZON = 24  # frames of an episode of the tabletop after the first one
+SPLITS = ("test", "unseen_colors", "more_objects")  # of the paper's figures
+Figures = Mapping[tuple[str, str, str], float]  # (split, variant, metric) -> figure
+Pairs = Sequence[tuple[float | None, float | None]]
 MakePlanner = Callable[[Imagines, Goal, np.random.Generator, int], Planner]
 """Makes a planner of a world model, the goal of the episode, a source of chance, and the seed of the slots."""
 
@@ -74,194 +76,105 @@ def _literal(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -
     return LiteralPlanner(cast(Foresees, model), seed=seed)  # which it never asks
 
 
-def _paper_frames(
-    label: str,
-    ssim: Mapping,
-    lpips: Mapping,
-    jedi: Sequence[float],
-    drops: Mapping,
-    more: Mapping | None = None,
-) -> Paper:
-    """The paper's figures of predicted frames: split -> (at 9, at 19 frames) each."""
-    figures: dict[tuple[str, str, str], float] = dict(more or {})
-    for metric, table in (("ssim", ssim), ("lpips", lpips), ("jedi", {"test": jedi}), *drops.items()):
-        for split, values in table.items():
-            for length, value in zip((9, 19), values, strict=True):
+def _paper(label: str, jedi: tuple[float, float], more: Figures | None = None, **columns: Pairs) -> Paper:
+    """The paper's figures of predicted frames: metric -> at 9 and at 19 frames, of each split that it has."""
+    figures = dict(more or {})
+    for metric, values in {**columns, "jedi": [jedi]}.items():
+        splits = SPLITS[1:] if metric.endswith("drop") else SPLITS
+        for split, pair in zip(splits, values, strict=False):
+            for variant, value in zip(("9 frames", "19 frames"), pair, strict=True):
                 if value is not None:
-                    figures[split, f"{length} frames", metric] = value
+                    figures[split, variant, metric] = value
     return Paper(label, figures)
 
 
-_OURS = _paper_frames(
+_OURS = _paper(
     "paper, TextOCVP",
-    ssim={"test": (0.950, 0.931), "unseen_colors": (0.946, 0.927), "more_objects": (0.936, 0.921)},
-    lpips={"test": (0.062, 0.078), "unseen_colors": (0.066, 0.083), "more_objects": (0.076, 0.090)},
+    ssim=[(0.950, 0.931), (0.946, 0.927), (0.936, 0.921)],
+    lpips=[(0.062, 0.078), (0.066, 0.083), (0.076, 0.090)],
+    ssim_drop=[(0.004, None), (0.015, 0.011)],
+    lpips_drop=[(0.064, 0.064), (0.226, 0.154)],
     jedi=(1.36, 2.23),
-    drops={
-        "ssim_drop": {"unseen_colors": (0.004, None), "more_objects": (0.015, 0.011)},
-        "lpips_drop": {"unseen_colors": (0.064, 0.064), "more_objects": (0.226, 0.154)},
-    },
     more={
         # Controllability: mean of 5 runs over 100 sequences.
-        **{
-            ("controllability", variant, "predicted_success"): value
-            for variant, value in zip(
-                ("original", "variant 1", "variant 2", "variant 3", "variants mean"),
-                (0.83, 0.86, 0.80, 0.81, 0.82),
-                strict=True,
-            )
-        },
+        ("controllability", "original", "predicted_success"): 0.83,
+        ("controllability", "variant 1", "predicted_success"): 0.86,
+        ("controllability", "variant 2", "predicted_success"): 0.80,
+        ("controllability", "variant 3", "predicted_success"): 0.81,
+        ("controllability", "variants mean", "predicted_success"): 0.82,
         ("test", "frames 1-9", "iou"): 0.573,
         ("test", "frames 1-19", "iou"): 0.569,
     },
 )
-_MAGE = _paper_frames(
+_MAGE = _paper(
     "paper, MAGE-DINO",
-    ssim={"test": (0.940, 0.931), "unseen_colors": (0.935, 0.924), "more_objects": (0.929, 0.920)},
-    lpips={"test": (0.064, 0.075), "unseen_colors": (0.076, 0.087), "more_objects": (0.088, 0.094)},
+    ssim=[(0.940, 0.931), (0.935, 0.924), (0.929, 0.920)],
+    lpips=[(0.064, 0.075), (0.076, 0.087), (0.088, 0.094)],
+    ssim_drop=[(0.005, 0.007), (0.012, 0.012)],
+    lpips_drop=[(0.19, 0.16), (0.375, 0.253)],
     jedi=(2.11, 2.59),
-    drops={
-        "ssim_drop": {"unseen_colors": (0.005, 0.007), "more_objects": (0.012, 0.012)},
-        "lpips_drop": {"unseen_colors": (0.19, 0.16), "more_objects": (0.375, 0.253)},
-    },
 )
-_TRUE_FRAMES = Paper(
-    "paper, parser on true frames",
-    {("test", "frames 1-9", "iou"): 0.554, ("test", "frames 1-19", "iou"): 0.553},
-)
-_COPY_SEED = Paper(
-    "paper, Copy-Seed", {("test", "frames 1-9", "iou"): 0.540, ("test", "frames 1-19", "iou"): 0.525}
-)
+
+
+def _paper_iou(label: str, at_9: float, at_19: float) -> Paper:
+    return Paper(label, {("test", "frames 1-9", "iou"): at_9, ("test", "frames 1-19", "iou"): at_19})
+
+
 _DATA = "--data data/tabletop-train.h5 --val data/tabletop-val.h5"
 _TRAIN_PREDICTOR = "textocvp train predictor --parser textocvp/checkpoints/tabletop-small"
+_TRAIN_LITE0 = "textocvp train parser --preset cliport-lite0 (docs/models.md has both commands)"
 
 METHODS: dict[str, Method] = {
     method.key: method
     for method in (
         Method(key="ours", hue=0, note="imagined from one frame and the sentence", plan=_best, paper=_OURS),
-        Method(
-            key="ours, 40 frames",
-            hue=7,
-            note="ours, trained on to look 40 frames ahead",
-            model="tabletop-small-40",
-            train=f"{_TRAIN_PREDICTOR} --finetune --set predictor.window=40 {_DATA} --out runs/window40 --steps 600 "
-            "--batch 16 --autoregressive 1.0 --horizon 20 --learning-rate 3e-4 --warmup 50",
-        ),
-        Method(
-            key="ours, taught by masks",
-            hue=7,
-            note="its parser learned from the simulator's masks",
-            model="cliport-masks",
-            train="textocvp train parser --preset cliport --teacher masks (docs/models.md has all three commands)",
-        ),
-        Method(
-            key="ours, frames parsed",
-            hue=0,
-            note="our parser reads the imagined frames, as it must for models without slots",
-        ),
-        Method(
-            key="ours, privileged",
-            kind="ceiling",
-            hue=3,
-            note="the same, but slots are named by the simulator's segmentation",
-            plan=_best,
-            privileged=True,
-        ),
-        Method(
-            key="savi",
-            hue=7,
-            note="published slot attention from pixels, and text",
-            model="savi-cater-trained",
-            train="python experiments/train_cater.py --only savi-cater",
-        ),
-        Method(
-            key="OCVP-Seq",
-            kind="baseline",
-            hue=5,
-            note="slots, but no text",
-            model="ocvp-seq-small",
-            train=f"{_TRAIN_PREDICTOR} --preset ocvp-seq-small {_DATA} --out runs/ocvp-seq --steps 1500 "
-            "--autoregressive 1.0",
-        ),
-        Method(
-            key="Non-OC",
-            kind="baseline",
-            hue=6,
-            note="text, but one vector for the whole scene",
-            model="non-oc-small",
-            slots=False,
-            train=f"textocvp train parser --preset non-oc-small {_DATA} --out runs/non-oc-parser --steps 5000 "
-            "--clip 3 --stride 8 --batch 16 --learning-rate 2e-3 && "
-            f"textocvp train predictor --parser runs/non-oc-parser/checkpoint {_DATA} --out runs/non-oc "
-            "--autoregressive 1.0 --content-weight 1 --image-weight 10 --image-frames 2 --steps 1800",
-        ),
-        Method(
-            key="MAGE",
-            kind="baseline",
-            hue=3,
-            note="text, and codes of picture patches instead of objects",
-            model="mage-small",
-            slots=False,
-            paper=_MAGE,
-            train=f"textocvp train vqvae {_DATA} --out runs/vqvae --steps 1600 && "
-            f"textocvp train mage --vqvae runs/vqvae/checkpoint {_DATA} --out runs/mage --steps 1800 "
-            "--autoregressive 0.8 --changed-weight 1",
-        ),
-        Method(
-            key="TextOCVP on EfficientNet-Lite0",
-            hue=5,
-            note="the published pipeline, with EfficientNet-Lite0 in DINOv2's place",
-            model="cliport-lite0",
-            train="textocvp train parser --preset cliport-lite0 (docs/models.md has both commands)",
-        ),
-        Method(
-            key="slot attention on EfficientNet-Lite0",
-            kind="ceiling",
-            hue=5,
-            note="its parser and renderer on the true frames, nothing imagined",
-            model="cliport-lite0",
-            train="textocvp train parser --preset cliport-lite0 (docs/models.md has both commands)",
-        ),
-        Method(
-            key="true frames",
-            kind="ceiling",
-            hue=1,
-            note="parser and renderer on the true frames, nothing imagined",
-            paper=_TRUE_FRAMES,
-        ),
-        Method(
-            key="wrong text", kind="control", hue=4, note="imagined with a sentence that names something else"
-        ),
+        Method(key="ours, 40 frames", hue=7, note="ours, trained on to look 40 frames ahead",
+               model="tabletop-small-40",
+               train=f"{_TRAIN_PREDICTOR} --finetune --set predictor.window=40 {_DATA} --out runs/window40 --steps 600 "
+               "--batch 16 --autoregressive 1.0 --horizon 20 --learning-rate 3e-4 --warmup 50"),
+        Method(key="ours, taught by masks", hue=7, note="its parser learned from the simulator's masks",
+               model="cliport-masks",
+               train="textocvp train parser --preset cliport --teacher masks (docs/models.md has all three commands)"),
+        Method(key="ours, frames parsed", hue=0,
+               note="our parser reads the imagined frames, as it must for models without slots"),
+        Method(key="ours, privileged", kind="ceiling", hue=3, plan=_best, privileged=True,
+               note="the same, but slots are named by the simulator's segmentation"),
+        Method(key="savi", hue=7, note="published slot attention from pixels, and text", model="savi-cater-trained",
+               train="python experiments/train_cater.py --only savi-cater"),
+        Method(key="OCVP-Seq", kind="baseline", hue=5, note="slots, but no text", model="ocvp-seq-small",
+               train=f"{_TRAIN_PREDICTOR} --preset ocvp-seq-small {_DATA} --out runs/ocvp-seq --steps 1500 "
+               "--autoregressive 1.0"),
+        Method(key="Non-OC", kind="baseline", hue=6, note="text, but one vector for the whole scene",
+               model="non-oc-small", slots=False,
+               train=f"textocvp train parser --preset non-oc-small {_DATA} --out runs/non-oc-parser --steps 5000 "
+               "--clip 3 --stride 8 --batch 16 --learning-rate 2e-3 && "
+               f"textocvp train predictor --parser runs/non-oc-parser/checkpoint {_DATA} --out runs/non-oc "
+               "--autoregressive 1.0 --content-weight 1 --image-weight 10 --image-frames 2 --steps 1800"),
+        Method(key="MAGE", kind="baseline", hue=3, note="text, and codes of picture patches instead of objects",
+               model="mage-small", slots=False, paper=_MAGE,
+               train=f"textocvp train vqvae {_DATA} --out runs/vqvae --steps 1600 && "
+               f"textocvp train mage --vqvae runs/vqvae/checkpoint {_DATA} --out runs/mage --steps 1800 "
+               "--autoregressive 0.8 --changed-weight 1"),
+        Method(key="TextOCVP on EfficientNet-Lite0", hue=5, model="cliport-lite0", train=_TRAIN_LITE0,
+               note="the published pipeline, with EfficientNet-Lite0 in DINOv2's place"),
+        Method(key="slot attention on EfficientNet-Lite0", kind="ceiling", hue=5, model="cliport-lite0",
+               train=_TRAIN_LITE0, note="its parser and renderer on the true frames, nothing imagined"),
+        Method(key="true frames", kind="ceiling", hue=1, paper=_paper_iou("paper, parser on true frames", 0.554, 0.553),
+               note="parser and renderer on the true frames, nothing imagined"),
+        Method(key="wrong text", kind="control", hue=4, note="imagined with a sentence that names something else"),
         Method(key="copy frame", kind="control", hue=2, note="the first frame repeated"),
-        Method(
-            key="copy seed",
-            kind="control",
-            hue=2,
-            note="the first frame's masks held still",
-            paper=_COPY_SEED,
-        ),
-        Method(
-            key="no imagination",
-            kind="control",
-            hue=4,
-            note="picks where the named block is seen, places where the named bowl is seen",
-            plan=_literal,
-            controller=LiteralController,
-        ),
+        Method(key="copy seed", kind="control", hue=2, note="the first frame's masks held still",
+               paper=_paper_iou("paper, Copy-Seed", 0.540, 0.525)),
+        Method(key="no imagination", kind="control", hue=4, plan=_literal, controller=LiteralController,
+               note="picks where the named block is seen, places where the named bowl is seen"),
         Method(key="expert", kind="ceiling", hue=1, note="scripted, knows every pose", expert=True),
-        Method(
-            key="random candidate",
-            kind="control",
-            hue=2,
-            note="the same robot carries out a random instruction",
-            plan=_random,
-        ),
+        Method(key="random candidate", kind="control", hue=2, plan=_random,
+               note="the same robot carries out a random instruction"),
     )
-}
+}  # fmt: skip
 BASELINES = tuple(key for key, method in METHODS.items() if method.kind == "baseline")
 """The models that ours is compared with, in the order of the tables."""
-PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)
-"""Who acts in the closed loop."""
+PLANNERS = tuple(key for key, method in METHODS.items() if method.acts)  # who acts in the closed loop
 OURS_40 = "ours, 40 frames"
 TRAINED_LITTLE = (
     "The bundled baselines are small and were trained for minutes on two cores, as their cards say: none of them was "

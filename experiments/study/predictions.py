@@ -58,8 +58,6 @@ def predict(
     """Let everybody imagine a scene, and then the expert carry out its instruction.
 
     Args:
-        worker: gives our model and the environment.
-        scene: which.
         models: the others that imagine it.
         horizon: how many frames to look ahead.
         seed: of the slots.
@@ -94,9 +92,7 @@ def predict(
     return truth, predictions
 
 
-def _predict_one(
-    worker: Worker, model: Model, seen: np.ndarray, text: str, horizon: int, seed: int
-) -> Prediction:
+def _predict_one(worker: Worker, model: Model, seen: np.ndarray, text: str, horizon: int, seed: int) -> Prediction:
     made, ahead = worker.model(model.load), _ahead(model.longest, horizon)
     if not model.slots:
         return Prediction(model.key, made.imagine(seen, [text], horizon=ahead, seed=seed)[0].float().cpu())

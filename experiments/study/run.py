@@ -32,8 +32,7 @@ from experiments.study.scenes import scene_line
 from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel, SlotModel
 
-RESULTS = Path("results")
-"""Where every study writes by default."""
+RESULTS = Path("results")  # where every study writes by default
 LARGEST_SEED = 999  # each seed has scenes of its own, and a split has so many
 
 
@@ -121,8 +120,7 @@ class Part:
 
     # of work; for a part that follows from the results of others, nothing, and `cases` makes them later
     units: Sequence[Unit[Any]] = ()
-    # of a unit on one core, roughly; they make the first estimate of the time that is left
-    seconds: float = 1.0
+    seconds: float = 1.0  # of a unit on one core, roughly; they make the first estimate of the time that is left
     count: int = 0  # units that are expected of a part that follows from others
 
 
@@ -159,10 +157,8 @@ class Study:
     horizon: int = 1  # how many frames the model must be able to imagine at once
     # files whose content changes figures, beside the checkpoints of `methods`
     inputs: Callable[[Any], Sequence[Path]] = lambda args: ()
-    # more entries of `versions` in results.json
-    versions: Callable[[Run], Mapping[str, str]] = lambda run: {}
-    # more files of the folder: name -> text
-    files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}
+    versions: Callable[[Run], Mapping[str, str]] = lambda run: {}  # more entries of `versions` in results.json
+    files: Callable[[Run, Found], Mapping[str, str]] = lambda run, found: {}  # more files of the folder: name -> text
     # more tables, that are printed after the others
     printed: Callable[[Run, Results], Sequence[Table]] = lambda run, results: ()
     # makes what the study needs once, `Run.prepared`; raises UsageError if the model does not do
@@ -266,10 +262,7 @@ class Run:
 def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
     """Run a study and write its folder. One that was interrupted goes on.
 
-    Args:
-        study: which.
-        args: the command line; by default as without options.
-        doubles: `load`, `sizes`, `loads` and `measures` of `Run`, whose errors come before any work is done.
+    `doubles` are `load`, `sizes`, `loads` and `measures` of `Run`, whose errors come before any work is done.
     """
     this = Run(study, args or study.args(), **doubles)
     _ = this.prepared  # may find that the model does not do
@@ -400,9 +393,7 @@ class OutputFolder:
             with tempfile.NamedTemporaryFile(dir=self.path, prefix=".writable-"):
                 pass
         except (FileExistsError, NotADirectoryError):
-            raise NotADirectoryError(
-                f"cannot write to {self.path}: a file of that name is in the way"
-            ) from None
+            raise NotADirectoryError(f"cannot write to {self.path}: a file of that name is in the way") from None
         except OSError as error:
             raise type(error)(f"cannot write to {self.path}: {error.strerror or error}") from None
 

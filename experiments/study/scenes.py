@@ -15,8 +15,7 @@ from envs import Expert
 from envs.splits import SPLITS
 from planning import Instruction, Thing
 
-LONG_GOALS = {"two_steps": 2, "three_steps": 3}
-"""Scenes of `test` seeds whose goals have 2 and 3 pairs."""
+LONG_GOALS = {"two_steps": 2, "three_steps": 3}  # scenes of `test` seeds whose goals have 2 and 3 pairs
 SCENES_PER_SEED = 10_000
 
 
@@ -26,8 +25,7 @@ class StudyScene:
 
     split: str  # its name, one of the environments' splits or of `LONG_GOALS`
     seed: int  # of the environment
-    # for `reset`; sorted items, so that a scene can be compared and hashed
-    options: tuple[tuple[str, Any], ...]
+    options: tuple[tuple[str, Any], ...]  # for `reset`; sorted items, so that a scene can be compared and hashed
     steps: int = 1  # pairs of the goal
     look: str = "simple"  # what it looks like: `scene` of the environment
     image_size: int = 64
@@ -57,9 +55,7 @@ def place_of(scene: StudyScene, variant: int = 0) -> str:
     return f"{scene.split}, {f'variant {variant}' if variant else 'original'}"
 
 
-def study_scenes(
-    split: str, count: int, seed: int, look: str = "simple", image_size: int = 64
-) -> list[StudyScene]:
+def study_scenes(split: str, count: int, seed: int, look: str = "simple", image_size: int = 64) -> list[StudyScene]:
     """`count` scenes of a split; each `seed` chooses other ones. Look and size: see `StudyScene`.
 
     Raises:
@@ -100,9 +96,7 @@ class SampledScene:
     def named_block(self) -> int:
         """The segmentation's value of the block that the scene's own instruction names."""
         thing = Instruction.parse(self.texts[0]).thing
-        return next(
-            item["label"] for item in self.info["objects"] if Thing(item["color"], item["kind"]) == thing
-        )
+        return next(item["label"] for item in self.info["objects"] if Thing(item["color"], item["kind"]) == thing)
 
     def others(self, thing: Thing) -> list[Thing]:
         """The scene's other things of the same kind, sorted."""
@@ -113,12 +107,7 @@ class SampledScene:
 def sample_scene(env: gym.Env[Any, Any], scene: StudyScene, variants: int = 0) -> SampledScene:
     """Sample a scene, and name other target bowls for its block.
 
-    Which bowls and in which order is a function of the scene's seed alone.
-
-    Args:
-        env: from `scene.make()`.
-        scene: which.
-        variants: how many other target bowls to name.
+    Which `variants` bowls and in which order is a function of the scene's seed alone. `env` is from `scene.make()`.
 
     Raises:
         ValueError: if the scene has too few bowls for that many variants.
@@ -162,14 +151,7 @@ class ExpertEpisode:
 def play_expert(
     env: gym.Env[Any, Any], sampled: SampledScene, variant: int = 0, order: Sequence[str | None] = (None,)
 ) -> ExpertEpisode:
-    """Let the scripted expert carry out one of the scene's texts.
-
-    Args:
-        env: of the scene.
-        sampled: the scene.
-        variant: which text the simulator judges.
-        order: what is done; by default what the text says.
-    """
+    """Let the scripted expert do what `order` says, by default the text that the simulator judges, the `variant`-th."""
     _, info = env.reset(seed=sampled.scene.seed, options=sampled.options(variant))
     frames, segmentations, gained = [info["frames"]], [info["frame_segmentations"]], 0.0
     for text in order:

@@ -11,20 +11,17 @@ from torch import nn
 import textocvp
 from envs.colors import COLORS
 from experiments.ablations import (
-    PREDICTORS,
-    RUNS,
     STUDY,
     Args,
     Entrant,
     FollowingScene,
     Outcome,
     Sizes,
-    find_run,
-    load_run,
     slots_name,
     tables,
 )
 from experiments.report.rows import Row, figure_rows
+from experiments.study.ablation_runs import PREDICTORS, RUNS, find_run, load_run
 from experiments.study.pool import Worker
 from experiments.study.run import run
 from experiments.study.scenes import study_scenes

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from envs.tasks.base import CLIPORT_RADIUS
-from experiments.cliport import STUDY, Args, Sizes, misses
+from experiments.cliport import STUDY, Args, Sizes
 from experiments.report.results import Results
 from experiments.study.any_size import fitted, mask_curves
+from experiments.study.cliport import misses
 from experiments.study.frame_metrics import Measures
 from experiments.study.run import UsageError, run
 from planning import Instruction, PinholeCamera

@@ -11,21 +11,15 @@ import textocvp
 from envs.tasks.rearrange import FAMILIES
 from experiments.imagination import (
     ATTEMPTS,
-    CASES,
-    LINES,
-    OURS,
     SEEDS,
     STUDY,
     Args,
-    ByFilms,
     Episode,
-    Foresight,
     Sizes,
-    TrueSlotsPlanner,
     family_scene,
-    foresight,
     goal_of,
 )
+from experiments.study.foresight import CASES, LINES, OURS, ByFilms, Foresight, TrueSlotsPlanner, foresight
 from experiments.study.pool import Worker
 from experiments.study.run import UsageError, run
 from planning import Goal, PictureGoal, SegmentationGrounder, Thing, places

@@ -11,24 +11,26 @@ import torch
 from experiments.interpretability import (
     BY_APPEARANCE,
     COLOR_TERM,
-    GROUPS,
     NO_COLOR_TERM,
     OURS,
     STUDY,
-    TEMPLATE,
     WRONG,
     AttentionOutcome,
     AttentionScene,
     Sizes,
     extreme_cases,
-    glow,
     headline,
+)
+from experiments.report.rows import figure_rows, pick_figures
+from experiments.study.attention import (
+    GROUPS,
+    TEMPLATE,
+    glow,
     lead,
     merge_tokens,
     read_attention,
     without_color_term,
 )
-from experiments.report.rows import figure_rows, pick_figures
 from experiments.study.pool import Worker
 from experiments.study.run import Run, StudyArgs, UsageError, run
 from experiments.study.scenes import study_scenes

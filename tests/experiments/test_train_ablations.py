@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 import experiments.train_ablations as training
-from experiments.ablations import PARSERS, PREDICTORS, RUNS, AblationRun, differences, find_run
+from experiments.study.ablation_runs import PARSERS, PREDICTORS, RUNS, AblationRun, differences, find_run
 from experiments.train_ablations import Args, main, run_named
 from tests.textocvp.conftest import PLACED, build
 from tests.textocvp.toy_episodes import write_toy_episodes

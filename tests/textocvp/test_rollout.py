@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from textocvp.drawing import slot_palette
+from textocvp.pictures import slot_palette
 from textocvp.renderers.base import Rendered, Renderer
 from textocvp.rollout import CHUNK, Rollout
 from textocvp.slots import SlotLayout, SlotState

@@ -10,11 +10,7 @@ from textocvp.data.cater import CaterEpisodes
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import EpisodeFile, Episodes
 
-FORMATS: dict[str, type[Episodes]] = {
-    "hdf5": EpisodeFile,
-    "cliport": CliportEpisodes,
-    "cater": CaterEpisodes,
-}
+FORMATS: dict[str, type[Episodes]] = {"hdf5": EpisodeFile, "cliport": CliportEpisodes, "cater": CaterEpisodes}
 """Every format by name, in the order in which they are tried."""
 
 

@@ -56,9 +56,7 @@ class FrameCache:
             if self._path(first).exists():
                 self._check(first)
 
-    def fill(
-        self, compute: Callable[[range], NDArray[Any]], process: int = 0, processes: int = 1
-    ) -> FrameCache:
+    def fill(self, compute: Callable[[range], NDArray[Any]], process: int = 0, processes: int = 1) -> FrameCache:
         """Compute every `processes`-th part, from part number `process` on, unless it is there already.
 
         Args:
@@ -111,9 +109,7 @@ class FrameCache:
         edges = self.starts[::PART]
         parts = np.searchsorted(edges, starts, side="right") - 1
         pairs = zip(parts, starts - edges[parts], strict=True)
-        return np.stack(
-            [self._read(self._firsts[part], slice(at, at + length, stride)) for part, at in pairs]
-        )
+        return np.stack([self._read(self._firsts[part], slice(at, at + length, stride)) for part, at in pairs])
 
     def _path(self, first: int) -> Path:
         return self.folder / f"{first:06d}.h5"
@@ -159,9 +155,7 @@ def parser_fingerprint(model: TextOCVP) -> str:
     return weights_fingerprint(model.parser, json.dumps(settings, sort_keys=True))
 
 
-def cached_slots(
-    model: TextOCVP, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1
-) -> FrameCache:
+def cached_slots(model: TextOCVP, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1) -> FrameCache:
     """The slots (K, D) float16 of every frame; this process's share of those that `folder` lacks is computed.
 
     Raises:

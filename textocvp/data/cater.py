@@ -47,9 +47,7 @@ class CaterEpisodes(Episodes):
             found = json.loads(self.path.read_text(encoding="utf-8"))
             entries = sorted(found.items(), key=lambda entry: int(entry[0]))
         except (ValueError, AttributeError) as error:
-            raise ValueError(
-                f"{path} is no list of captions, number -> video and caption: {error}"
-            ) from error
+            raise ValueError(f"{path} is no list of captions, number -> video and caption: {error}") from error
         kept, problems = [], []
         for number, entry in entries:
             try:

@@ -14,15 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from textocvp.data.episodes import (
-    FIRST_OBJECT,
-    ROBOT,
-    Episode,
-    EpisodeObject,
-    Episodes,
-    Truth,
-    swapped_questions,
-)
+from textocvp.data.episodes import FIRST_OBJECT, ROBOT, Episode, EpisodeObject, Episodes, Truth, swapped_questions
 
 
 class CliportEpisodes(Episodes):
@@ -60,9 +52,7 @@ class CliportEpisodes(Episodes):
         self.image_size = max(sizes, key=lambda side: sizes[side], default=0)
         for file, _, (_, side, *_) in usable:
             if side != self.image_size:
-                problems.append(
-                    f"{file}: frames of {side}x{side}, the others have {self.image_size}x{self.image_size}"
-                )
+                problems.append(f"{file}: frames of {side}x{side}, the others have {self.image_size}x{self.image_size}")
         kept = [one for one in usable if one[2][1] == self.image_size][:first]
         if not kept:
             why = f": {problems[0]}" if problems else ": no npz files"

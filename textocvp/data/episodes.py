@@ -46,20 +46,16 @@ class Question(NamedTuple):
 class Truth:
     """What is known of an episode besides its frames. Used to measure, never to train."""
 
-    segmentation: NDArray[np.uint8] | None = None
-    """(T, H, W) labels, 0 the background; None where there are no masks."""
-    robot: int | None = None
-    """The robot's label, if there is a robot."""
+    segmentation: NDArray[np.uint8] | None = None  # (T, H, W) labels, 0 the background; None where there are no masks
+    robot: int | None = None  # the robot's label, if there is a robot
     objects: tuple[EpisodeObject, ...] = ()
     questions: tuple[Question, ...] = ()
     supports: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     """What carries each object before and after the episode: an id, -1 the table, -2 nothing that has an id."""
-    position: NDArray[np.float32] | None = None
-    """(T, n, 3) where the n objects are, metres, in the world frame."""
+    position: NDArray[np.float32] | None = None  # (T, n, 3) where the n objects are, metres, in the world frame
     intrinsics: NDArray[np.float64] | None = None
     """(3, 3) of the camera, in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
-    extrinsics: NDArray[np.float64] | None = None
-    """(4, 4) of the camera, world to camera, metres."""
+    extrinsics: NDArray[np.float64] | None = None  # (4, 4) of the camera, world to camera, metres
 
     def question(self, text: str) -> Question | None:
         """The question with this sentence, if there is one."""
@@ -70,21 +66,16 @@ class Truth:
 class Episode(Truth):
     """Everything of one episode of T frames."""
 
-    frames: NDArray[np.uint8]
-    """(T, H, W, 3), 0..255; frame 0 is seen before anything moves."""
+    frames: NDArray[np.uint8]  # (T, H, W, 3), 0..255; frame 0 is seen before anything moves
     instruction: str
-    seed: int | None = None
-    """The scene's seed in the simulator, if it has one."""
-    success: bool | None = None
-    """Whether the instruction was carried out, if that was judged."""
+    seed: int | None = None  # the scene's seed in the simulator, if it has one
+    success: bool | None = None  # whether the instruction was carried out, if that was judged
     reset_options: dict[str, Any] | None = None
     """What the simulator's `reset` was given beside the seed, if it is known."""
     action: NDArray[np.float32] | None = None
     """(T, A) what was done from each frame on; the last leads to no frame. Collected files: tool motions, A = 5."""
-    reward: NDArray[np.float32] | None = None
-    """(T,) for what was done from each frame on."""
-    state: NDArray[np.float32] | None = None
-    """(T, S) of the robot; in collected files S = 11: `arm` and `gripper`."""
+    reward: NDArray[np.float32] | None = None  # (T,) for what was done from each frame on
+    state: NDArray[np.float32] | None = None  # (T, S) of the robot; in collected files S = 11: `arm` and `gripper`
     primitives: tuple[dict[str, Any], ...] = ()
     """Whole pick-and-places: the `frame` from which on, and the `action` [pick_x, pick_y, place_x, place_y], metres."""
 
@@ -289,9 +280,7 @@ class EpisodeFile(Episodes):
         if self._version == 1:
             items = [{"id": id, "label": FIRST_OBJECT + id, **item} for id, item in enumerate(items)]
         names = EpisodeObject._fields
-        objects = tuple(
-            EpisodeObject(**{name: item[name] for name in names if name in item}) for item in items
-        )
+        objects = tuple(EpisodeObject(**{name: item[name] for name in names if name in item}) for item in items)
         if self._version > 1:
             robot = json.loads(file.attrs.get("labels", "{}")).get("robot")
             questions = tuple(Question(**item) for item in self._json("questions", number))
@@ -300,9 +289,7 @@ class EpisodeFile(Episodes):
             questions = swapped_questions(self.instructions[number], objects, moves, ends_at)
         supports = None
         if "supports_before" in file["episode"]:
-            before, after = (
-                file[f"episode/supports_{when}"][number, : len(objects)] for when in ("before", "after")
-            )
+            before, after = (file[f"episode/supports_{when}"][number, : len(objects)] for when in ("before", "after"))
             supports = (tuple(before.tolist()), tuple(after.tolist()))
         position = intrinsics = extrinsics = None
         if "object_position" in file:
@@ -405,9 +392,7 @@ def swapped_questions(
         return ()
     template = instruction.replace(names[0], "\0").replace(names[1], "\1")
     return tuple(
-        Question(
-            template.replace("\0", f"{a.color} {a.kind}").replace("\1", f"{b.color} {b.kind}"), a.id, b.id
-        )
+        Question(template.replace("\0", f"{a.color} {a.kind}").replace("\1", f"{b.color} {b.kind}"), a.id, b.id)
         for a in objects
         for b in objects
         if a.kind == first.kind and b.kind == second.kind and a.id != b.id

@@ -24,19 +24,12 @@ from textocvp.text.base import TextEncoder, WordBatch
 
 @dataclass
 class SlotBatch:
-    """Episodes of one length.
+    """Episodes of one length."""
 
-    Attributes:
-        slots_BTKD: true slots, float32; slots that no episode of the batch uses are left out.
-        words: the sentences, looked up.
-        episodes_B: numbers of the episodes.
-        channels_B3: the order in which their colour channels are.
-    """
-
-    slots_BTKD: Tensor
-    words: WordBatch
-    episodes_B: np.ndarray
-    channels_B3: Tensor
+    slots_BTKD: Tensor  # true slots, float32; slots that no episode of the batch uses are left out
+    words: WordBatch  # the sentences, looked up
+    episodes_B: np.ndarray  # numbers of the episodes
+    channels_B3: Tensor  # the order in which their colour channels are
 
 
 class SlotBatches:
@@ -128,9 +121,7 @@ class SlotBatches:
         return replace(state, position=state.position + noise * state.is_thing).join()
 
     def _noise(self, rng: np.random.Generator, shape: tuple[int, ...], deviation: float) -> Tensor:
-        return (
-            torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)).to(self.device) * deviation
-        )
+        return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32)).to(self.device) * deviation
 
 
 def padded(slots: FrameCache, frames: int, every: int = 1) -> Tensor:
@@ -138,9 +129,7 @@ def padded(slots: FrameCache, frames: int, every: int = 1) -> Tensor:
     return torch.from_numpy(slots.at(np.arange(len(slots)), every * np.arange(frames)))
 
 
-def true_frames(
-    episodes: Episodes, episodes_B: np.ndarray, times_BS: np.ndarray, channels_B3: Tensor
-) -> Tensor:
+def true_frames(episodes: Episodes, episodes_B: np.ndarray, times_BS: np.ndarray, channels_B3: Tensor) -> Tensor:
     """Frames (B, S, 3, H, W), -1..1, of these times of these episodes, with their colour channels in these orders."""
     clips = [episodes.frames(index) for index in episodes_B]
     chosen = [clip[np.minimum(times, len(clip) - 1)] for clip, times in zip(clips, times_BS, strict=True)]

@@ -49,18 +49,10 @@ class Backbone:
 
 BACKBONES: dict[str, Backbone] = {
     "alex": Backbone(
-        "AlexNet",
-        "alexnet.ckpt",
-        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
-        "AlexNet_0",
-        5,
+        "AlexNet", "alexnet.ckpt", "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1", "AlexNet_0", 5
     ),
     "vgg": Backbone(
-        "VGG16",
-        "vgg16.ckpt",
-        "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
-        "VGG16_0",
-        13,
+        "VGG16", "vgg16.ckpt", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d", "VGG16_0", 13
     ),
 }
 """By the name that the package lpips gives them."""
@@ -141,9 +133,7 @@ def tensors_of(content: bytes, backbone: Backbone) -> dict[str, Tensor]:
         tensors = {}
         for i in range(backbone.convolutions):
             convolution = params[backbone.scope][f"Conv_{i}"]
-            tensors[f"convolution.{i}.weight"] = (
-                _tensor(convolution, "kernel", 4).permute(3, 2, 0, 1).contiguous()
-            )
+            tensors[f"convolution.{i}.weight"] = _tensor(convolution, "kernel", 4).permute(3, 2, 0, 1).contiguous()
             tensors[f"convolution.{i}.bias"] = _tensor(convolution, "bias", 1)
         for i in range(backbone.layers):
             tensors[f"layer.{i}"] = _tensor(params[f"NetLinLayer_{i}"]["Conv_0"], "kernel", 4).flatten()

@@ -52,12 +52,8 @@ class PerceptualDistance:
     """A distance between pictures, lower is more alike."""
 
     name: str  # of the metric and its backbone, for tables
-    describe: Callable[
-        [Tensor], Sequence[Tensor]
-    ]  # pictures (N, 3, H, W) in -1..1 to feature maps (N, C, h, w)
-    difference: Callable[
-        [Sequence[Tensor], Sequence[Tensor]], Tensor
-    ]  # maps of N pictures and N others to (N,)
+    describe: Callable[[Tensor], Sequence[Tensor]]  # pictures (N, 3, H, W) in -1..1 to feature maps (N, C, h, w)
+    difference: Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # maps of N pictures and N others to (N,)
 
     def __call__(self, imagined: Tensor, real: Tensor) -> Tensor:
         """Distance (...) of each of the frames (..., 3, H, W) in 0..1.
@@ -141,11 +137,7 @@ def load_lpips(net: str = "alex") -> PerceptualDistance:
     backbone, path = BACKBONES[net], weights_path(net)
     try:
         import lpips
-    except (
-        ImportError,
-        RuntimeError,
-        OSError,
-    ) as error:  # RuntimeError: a torchvision built for another torch
+    except (ImportError, RuntimeError, OSError) as error:  # RuntimeError: a torchvision built for another torch
         raise MetricUnavailable(
             f"LPIPS needs the package lpips and a torchvision that fits the installed torch: {error}"
         ) from error
@@ -162,9 +154,7 @@ def load_lpips(net: str = "alex") -> PerceptualDistance:
             f"keeps them in {path.parent}; else the library needs a network to download torchvision's"
         ) from error
     # The library takes two pictures at once, so their features are the pictures themselves.
-    return PerceptualDistance(
-        f"LPIPS ({backbone.name})", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten()
-    )
+    return PerceptualDistance(f"LPIPS ({backbone.name})", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten())
 
 
 @torch.no_grad()
@@ -173,10 +163,8 @@ def _set_lpips_weights(network: Any, tensors: Mapping[str, Tensor]) -> None:
     convolutions = [module for module in network.net.modules() if isinstance(module, nn.Conv2d)]
     targets = {f"layer.{i}": layer.model[-1].weight for i, layer in enumerate(network.lins)}
     for i, convolution in enumerate(convolutions):
-        targets[f"convolution.{i}.weight"], targets[f"convolution.{i}.bias"] = (
-            convolution.weight,
-            convolution.bias,
-        )
+        targets[f"convolution.{i}.weight"] = convolution.weight
+        targets[f"convolution.{i}.bias"] = convolution.bias
     if other := sorted(targets.keys() ^ tensors.keys()):
         raise KeyError(f"the kept weights are of another network: {other[0]}")
     for name, target in targets.items():

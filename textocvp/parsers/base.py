@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from textocvp.parsers.frozen import FrozenEncoder
 from textocvp.slots import SlotLayout
 
+Generators = torch.Generator | Sequence[torch.Generator] | None  # one for all clips, or one for each
 MOST_SLOTS = 1000  # more would fill the memory before anything is seen
 
 
@@ -48,9 +49,7 @@ class ParserConfig:
     @staticmethod
     def _check_heads(width: int, heads: int) -> None:
         if width % heads:
-            raise ValueError(
-                f"parser.transition_heads = {heads} does not divide the transition's width {width}"
-            )
+            raise ValueError(f"parser.transition_heads = {heads} does not divide the transition's width {width}")
 
 
 @dataclass
@@ -78,13 +77,7 @@ class SceneParser(nn.Module):
         self.frozen: FrozenEncoder | None = None  # a frozen image encoder, which is no part of the checkpoint
 
     @abstractmethod
-    def forward(
-        self,
-        frames_BT3HW: Tensor,
-        *,
-        num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Parsed:
+    def forward(self, frames_BT3HW: Tensor, *, num_slots: int | None = None, generator: Generators = None) -> Parsed:
         """Parse clips.
 
         Args:

@@ -78,9 +78,7 @@ class ClusterInitializer(nn.Module):
         onehot_BSN = self._unite(onehot_BNS.transpose(1, 2), colors_BNC, H, W)
         return self._largest(onehot_BSN, num_slots, H, W)
 
-    def _seed(
-        self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int, seeds: int
-    ) -> tuple[Tensor, Tensor]:
+    def _seed(self, points_BNC: Tensor, to_background_BN: Tensor, H: int, W: int, seeds: int) -> tuple[Tensor, Tensor]:
         B, _, C = points_BNC.shape
         nearest_BN = to_background_BN.clone()
         centers, used = [], []
@@ -95,9 +93,7 @@ class ClusterInitializer(nn.Module):
             nearest_BN = torch.minimum(nearest_BN, (points_BNC - center_B1C).square().sum(-1))
         return torch.cat(centers, 1), torch.cat(used, 1)
 
-    def _k_means(
-        self, points_BNC: Tensor, to_background_BN: Tensor, centers_BSC: Tensor, used_BS: Tensor
-    ) -> Tensor:
+    def _k_means(self, points_BNC: Tensor, to_background_BN: Tensor, centers_BSC: Tensor, used_BS: Tensor) -> Tensor:
         S = centers_BSC.shape[1]
         for last in [False] * self.rounds + [True]:
             distance_BNS = squared_distances(points_BNC, centers_BSC)

@@ -61,9 +61,7 @@ class EfficientNetEncoder(FrozenEncoder):
                 if x.shape[-1] * self.patch == PROBE:
                     kept, dim = count, x.shape[1]
         if not kept:
-            raise WeightsError(
-                f"{self.part}.encoder_patch is {self.patch}: no block of {LITE0} has that stride"
-            )
+            raise WeightsError(f"{self.part}.encoder_patch is {self.patch}: no block of {LITE0} has that stride")
         self._check_sizes(dim, self.patch, str(path))
         return nn.Sequential(*layers[:kept]), found
 

@@ -43,13 +43,7 @@ class FrozenEncoder(nn.Module):
     """
 
     def __init__(
-        self,
-        weights: str | Path = "",
-        *,
-        dim: int,
-        patch: int,
-        fingerprint: str = "",
-        part: str = "parser",
+        self, weights: str | Path = "", *, dim: int, patch: int, fingerprint: str = "", part: str = "parser"
     ) -> None:
         super().__init__()
         self.weights, self.dim, self.patch = str(weights), dim, patch
@@ -104,6 +98,4 @@ class FrozenEncoder(nn.Module):
         """Raise a WeightsError where the weights in `where` are of another size than the configuration says."""
         for field, wanted, has in (("encoder_dim", self.dim, dim), ("encoder_patch", self.patch, patch)):
             if wanted != has:
-                raise WeightsError(
-                    f"{self.part}.{field} is {wanted}, that of the weights in {where} is {has}"
-                )
+                raise WeightsError(f"{self.part}.{field} is {wanted}, that of the weights in {where} is {has}")

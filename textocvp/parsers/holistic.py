@@ -5,16 +5,14 @@ Convolutions and an average pooling make one vector of each frame. All that foll
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from textocvp.layers import PositionCode, init_relu_
-from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
+from textocvp.parsers.base import Generators, Parsed, ParserConfig, SceneParser
 from textocvp.slots import SlotLayout
 
 
@@ -64,13 +62,7 @@ class HolisticParser(SceneParser):
         self.slot = nn.Linear(2 * wide * config.pool_cells**2, config.layout.dim)
         init_relu_(self)
 
-    def forward(
-        self,
-        frames_BT3HW: Tensor,
-        *,
-        num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Parsed:
+    def forward(self, frames_BT3HW: Tensor, *, num_slots: int | None = None, generator: Generators = None) -> Parsed:
         """See `SceneParser`. Nothing is drawn at random, so `generator` is not used.
 
         Raises:

@@ -11,7 +11,6 @@ channels of the video are permuted: that is what lets training recolour whole sc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 
 from textocvp.crop import crop
 from textocvp.layers import pixel_grid
-from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
+from textocvp.parsers.base import Generators, Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, color_features, squared_distances
 from textocvp.slots import PRESENCE_BACKGROUND, SlotState, moments
 
@@ -103,15 +102,10 @@ class PlacedCorrector(nn.Module):
         )
         self.gru = nn.GRUCell(content, content)
         self.mlp = nn.Sequential(
-            nn.LayerNorm(content),
-            nn.Linear(content, config.hidden),
-            nn.ReLU(),
-            nn.Linear(config.hidden, content),
+            nn.LayerNorm(content), nn.Linear(content, config.hidden), nn.ReLU(), nn.Linear(config.hidden, content)
         )
 
-    def forward(
-        self, frames: Tensor, state: SlotState, attention: Tensor | None = None
-    ) -> tuple[SlotState, Tensor]:
+    def forward(self, frames: Tensor, state: SlotState, attention: Tensor | None = None) -> tuple[SlotState, Tensor]:
         """The corrected slots and the attention (B, K, H, W) for frames (B, 3, H, W)."""
         if attention is None:  # given on the first frame: the clusters themselves
             attention = self.attend(frames, state)
@@ -127,9 +121,7 @@ class PlacedCorrector(nn.Module):
         content = torch.where(seen, content, state.content)
         return SlotState(content, state.color, position, scale, state.presence), attention
 
-    def _crops(
-        self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor
-    ) -> Tensor:
+    def _crops(self, frames: Tensor, attention: Tensor, position: Tensor, scale: Tensor, color: Tensor) -> Tensor:
         luminance_B1HW = ((frames + 1) / 2).mean(1, keepdim=True)
         own_BK11 = ((color + 1) / 2).mean(-1)[..., None, None]
         shading_BKHW = attention * (luminance_B1HW / own_BK11.clamp_min(0.05) - 1).clamp(-1, 2)
@@ -178,13 +170,7 @@ class PlacedParser(SceneParser):
         self.corrector = PlacedCorrector(config)
         self.transition = PlacedTransition(config)
 
-    def forward(
-        self,
-        frames_BT3HW: Tensor,
-        *,
-        num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Parsed:
+    def forward(self, frames_BT3HW: Tensor, *, num_slots: int | None = None, generator: Generators = None) -> Parsed:
         """See `SceneParser.forward`. Nothing is drawn at random: `generator` changes nothing."""
         state, attention = self.first(frames_BT3HW[:, 0], num_slots or self.config.num_slots)
         slots, attentions, expectations = [state.join()], [attention], []

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from textocvp.layers import PositionCode, init_relu_
-from textocvp.parsers.base import Parsed, ParserConfig, SceneParser
+from textocvp.parsers.base import Generators, Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.parsers.efficientnet import LITE0, EfficientNetEncoder
@@ -39,8 +39,7 @@ class SaviConfig(ParserConfig):
     encoder_weights: str = ""
     encoder_dim: int = 768  # width of its features
     encoder_patch: int = 14  # side of its patches in pixels
-    # Of its weights, set when a model that has used them is saved; others are an error.
-    encoder_fingerprint: str = ""
+    encoder_fingerprint: str = ""  # of its weights, set when a model that has used them is saved; others are an error
     iterations_first: int = 1  # of the corrector on the first frame; later frames take one
     transition_heads: int = 4  # of the transformer block between frames
     transition_hidden: int = 128
@@ -87,10 +86,7 @@ class FeatureProjection(nn.Module):
         self.position = PositionCode(feature_dim) if place else nn.Identity()
         hidden = max(feature_dim, out_dim)
         self.mlp = nn.Sequential(
-            nn.LayerNorm(feature_dim),
-            nn.Linear(feature_dim, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, out_dim),
+            nn.LayerNorm(feature_dim), nn.Linear(feature_dim, hidden), nn.ReLU(), nn.Linear(hidden, out_dim)
         )
 
     def forward(self, features_NFhw: Tensor) -> Tensor:
@@ -105,12 +101,7 @@ class GaussianInitializer(nn.Module):
         self.mean = nn.Parameter(torch.randn(slot_dim) * slot_dim**-0.5)
         self.log_deviation = nn.Parameter(torch.zeros(slot_dim))
 
-    def forward(
-        self,
-        batch: int,
-        num_slots: int,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Tensor:
+    def forward(self, batch: int, num_slots: int, generator: Generators = None) -> Tensor:
         """(batch, num_slots, D) slots."""
         size, mean = (num_slots, len(self.mean)), self.mean
         if isinstance(generator, Sequence):
@@ -233,7 +224,7 @@ class SaviParser(SceneParser):
         frames_BT3HW: Tensor,
         *,
         num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        generator: Generators = None,
         features_BTLF: Tensor | None = None,
     ) -> Parsed:
         """Parse clips; see `SceneParser.forward`.

@@ -11,7 +11,6 @@ one background, or even light. Place, size and colour of a slot are explicit, it
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,18 +21,15 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from textocvp.layers import full_precision, init_relu_
-from textocvp.parsers.base import Parsed, SceneParser
+from textocvp.parsers.base import Generators, Parsed, SceneParser
 from textocvp.parsers.clustering import color_features
 from textocvp.parsers.placed import CropConfig, PlacedCorrector
 from textocvp.slots import PRESENCE_BACKGROUND, PRESENCE_THING, ROBOT_SLOT, SlotState, moments
 
 BACKGROUND, OBJECT, ROBOT = 0, 1, 2  # classes of pixels
 REACH = 8.0  # pixels in which votes are written: an object's radius or so
-SIZE_UNIT = (
-    12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
-)
-# In that unit: smaller radii than this are alike, for a half hidden block is one block, not two.
-SMALLEST = 14.3
+SIZE_UNIT = 12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
+SMALLEST = 14.3  # in that unit: smaller radii are alike, for a half hidden block is one block, not two
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
@@ -46,30 +42,20 @@ UNSEEN = 0.0  # colour of a slot that holds nothing yet
 # and SEARCH together, and its differences in colour and log-size.
 SEARCH = 0.08
 COLOR_COST, SIZE_COST = 4.0, 0.7
-MOST_COST, PIECE_COST = (
-    2.5,
-    1.2,
-)  # up to which a thing is that of a slot, and what nobody has is a piece of it
+MOST_COST, PIECE_COST = 2.5, 1.2  # up to which a thing is that of a slot, and what nobody has is a piece of it
 
 
 @dataclass(frozen=True)
 class VotesConfig(CropConfig):
-    """Options of `VotesParser`; `num_slots` includes the background and the robot.
-
-    Attributes:
-        channels: of the network at half resolution; below there are 2, 3 and 4 times as many.
-        channels_full: at full resolution.
-        min_votes: a smaller peak of the votes is no object.
-        peak_radius: pixels of votes within which there is no second object.
-        memory: what a slot holds is updated from frame to frame, or else read afresh from each frame that shows it,
-            so that what looks alike is alike.
-    """
+    """Options of `VotesParser`; `num_slots` includes the background and the robot."""
 
     kind: Literal["votes"] = "votes"
-    channels: int = 24
-    channels_full: int = 16
-    min_votes: float = 4.0
-    peak_radius: float = 5.0
+    channels: int = 24  # of the network at half resolution; below there are 2, 3 and 4 times as many
+    channels_full: int = 16  # at full resolution
+    min_votes: float = 4.0  # a smaller peak of the votes is no object
+    peak_radius: float = 5.0  # pixels of votes within which there is no second object
+    # What a slot holds is updated from frame to frame, or else read afresh from each frame that shows it, so that
+    # what looks alike is alike
     memory: bool = True
 
     def __post_init__(self) -> None:
@@ -135,19 +121,13 @@ class VoteNetwork(nn.Module):
 
 @dataclass
 class VoteTargets:
-    """What the network should say of frames with known masks.
+    """What the network should say of frames with known masks."""
 
-    Attributes:
-        classes_NHW: `BACKGROUND`, `OBJECT` or `ROBOT`.
-        votes_N3HW: from each pixel to the mean of the pixels with its label, (x, y) in pixels, and the logarithm of
-            their root mean square distance from it, in units of `SIZE_UNIT`. Hiding the middle of a thing changes both
-            little.
-        area_NHW: number of pixels with its label.
-    """
-
-    classes_NHW: Tensor
+    classes_NHW: Tensor  # `BACKGROUND`, `OBJECT` or `ROBOT`
+    # From each pixel to the mean of the pixels with its label, (x, y) in pixels, and the logarithm of their root
+    # mean square distance from it, in units of `SIZE_UNIT`. Hiding the middle of a thing changes both little.
     votes_N3HW: Tensor
-    area_NHW: Tensor
+    area_NHW: Tensor  # number of pixels with its label
 
 
 def vote_targets(labels_NHW: Tensor) -> VoteTargets:
@@ -179,33 +159,23 @@ def vote_loss(logits_N3HW: Tensor, votes_N3HW: Tensor, targets: VoteTargets) -> 
         # ends is as important as where it is.
         weight_NHW = objects_NHW * (100 / targets.area_NHW).sqrt().clamp(0.5, 4)
         around_NHW = 1 + 3 * F.max_pool2d(weight_NHW, 7, 1, 3)
-        cross_N = (F.cross_entropy(logits_N3HW, targets.classes_NHW, reduction="none") * around_NHW).mean(
-            (1, 2)
-        )
+        cross_N = (F.cross_entropy(logits_N3HW, targets.classes_NHW, reduction="none") * around_NHW).mean((1, 2))
         share_NHW = logits_N3HW.softmax(1)[:, OBJECT]
         both, either = (share_NHW * objects_NHW).sum((1, 2)), (share_NHW + objects_NHW).sum((1, 2))
         dice_N = 1 - (2 * both + 10) / (either + 10)
-        apart_NHW = F.smooth_l1_loss(
-            votes_N3HW / REACH, targets.votes_N3HW / REACH, reduction="none", beta=0.1
-        ).sum(1)
+        apart_NHW = F.smooth_l1_loss(votes_N3HW / REACH, targets.votes_N3HW / REACH, reduction="none", beta=0.1).sum(1)
         place_N = (apart_NHW * weight_NHW).sum((1, 2)) / weight_NHW.sum((1, 2)).clamp_min(1)
         return (cross_N + 0.3 * dice_N + 2 * place_N).mean()
 
 
 @dataclass
 class Ballot:
-    """The votes of one frame's object pixels, and the objects that they elect.
+    """The votes of one frame's object pixels, and the objects that they elect."""
 
-    Attributes:
-        y_L, x_L: rows and columns of the pixels.
-        votes_L3: where they say that their object's centre is, (x, y) in pixels and its size.
-        peaks_P3: where these are densest, the densest first.
-    """
-
-    y_L: Tensor
+    y_L: Tensor  # rows and columns of the pixels
     x_L: Tensor
-    votes_L3: Tensor
-    peaks_P3: Tensor
+    votes_L3: Tensor  # where they say that their object's centre is, (x, y) in pixels and its size
+    peaks_P3: Tensor  # where these are densest, the densest first
 
     def elect(self, candidates_C3: Tensor) -> Tensor:
         """To which of some candidates each pixel goes (L,): the one nearest to its vote."""
@@ -226,9 +196,7 @@ def count_votes(
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
     some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
     near_SS = _apart(some_S3, some_S3)
-    density_S = (
-        torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1) * len(votes_L3) / max(1, len(some_S3))
-    )
+    density_S = torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1) * len(votes_L3) / max(1, len(some_S3))
     # Large objects need more votes: else the stray ones of their borders would be objects of their own.
     enough_S = (MIN_SHARE * _pixels_of(some_S3)).clamp_min(min_votes)
     density_S = density_S.masked_fill(density_S < enough_S, 0.0)
@@ -250,9 +218,7 @@ def _pixels_of(votes_N3: Tensor) -> Tensor:
     return 6 * (2 / SIZE_UNIT * votes_N3[:, 2]).exp()
 
 
-def follow(
-    ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, peak_radius: float = 5.0
-) -> Tensor:
+def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, peak_radius: float = 5.0) -> Tensor:
     """The slot (L,) of each of one frame's object pixels, by place, colour and size.
 
     Args:
@@ -275,9 +241,7 @@ def follow(
     size_KP = (scale_P2.log().mean(-1) - state.scale.log().mean(-1, keepdim=True)).abs()
     cost_KP = torch.log1p(off_KP.square()) + COLOR_COST * torch.cdist(color_features(state.color), hue_P4)
     used_K = state.is_thing[:, 0].cpu().numpy()
-    used, free = (
-        FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:])
-    )
+    used, free = (FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:]))
     cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
     rows, columns = linear_sum_assignment(cost_UP)
     sure = cost_UP[rows, columns] < MOST_COST
@@ -322,13 +286,7 @@ class VotesParser(SceneParser):
         self.network = VoteNetwork(channels, config.channels_full)
         self.corrector = PlacedCorrector(config)
 
-    def forward(
-        self,
-        frames_BT3HW: Tensor,
-        *,
-        num_slots: int | None = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    ) -> Parsed:
+    def forward(self, frames_BT3HW: Tensor, *, num_slots: int | None = None, generator: Generators = None) -> Parsed:
         """Parse clips; see `SceneParser.forward`. Nothing is drawn at random here: `generator` changes nothing.
 
         No gradient reaches the network, which learns from `vote_loss`. What is expected of a slot is what it was.
@@ -363,18 +321,13 @@ class VotesParser(SceneParser):
         """What each slot covers (B, K, H, W), which sums to 1 over the slots."""
         # Votes are counted on the CPU: a GPU would wait for each of many small steps.
         logits_B3HW, votes_B3HW = (part.cpu() for part in self.network(frames_B3HW))
-        slots, seen_B3HW, speeds_BK2 = (
-            SlotState(*(part.cpu() for part in vars(state).values())),
-            frames_B3HW.cpu(),
-            speed_BK2.cpu(),
-        )
+        slots = SlotState(*(part.cpu() for part in vars(state).values()))
+        seen_B3HW, speeds_BK2 = frames_B3HW.cpu(), speed_BK2.cpu()
         B, K = state.presence.shape[:2]
         slot_BHW = ROBOT_SLOT * (logits_B3HW.argmax(1) == ROBOT)
         for b in range(B):
             radius = self.config.peak_radius
-            ballot = count_votes(
-                logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes, radius
-            )
+            ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes, radius)
             one = SlotState(*(part[b] for part in vars(slots).values()))
             slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], one, speeds_BK2[b], radius)
         return F.one_hot(slot_BHW.to(frames_B3HW.device), K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)

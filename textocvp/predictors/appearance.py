@@ -30,11 +30,7 @@ class Appearance(nn.Module):
 
     What words say of a thing adds up over the last `PHRASE` words: at "cone", all of "the large red metal cone" counts.
     What is not said anew is said of the thing that was named last: in "the cone is sliding to (1, 2)" the 1 and the 2
-    are the cone's.
-
-    Args:
-        layout: of the slots, which must be explicit.
-        text_dim: width of a word's embedding.
+    are the cone's. The slots' layout must be explicit.
     """
 
     def __init__(self, layout: SlotLayout, text_dim: int) -> None:
@@ -42,26 +38,18 @@ class Appearance(nn.Module):
         # Apart from each other, so that what is learned of red things holds for a shape that was never red.
         self.color = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, WIDTH))
         self.size = nn.Sequential(nn.Linear(4, 32), nn.ReLU(), nn.Linear(32, WIDTH))
-        self.shape = nn.Sequential(
-            nn.Dropout(0.2), nn.Linear(layout.content + 2, 64), nn.ReLU(), nn.Linear(64, WIDTH)
-        )
+        self.shape = nn.Sequential(nn.Dropout(0.2), nn.Linear(layout.content + 2, 64), nn.ReLU(), nn.Linear(64, WIDTH))
         self.words = nn.Linear(text_dim, WIDTH)
         self.phrase_P = nn.Parameter(torch.ones(PHRASE))  # weight of a word by how far back it is
         self.names = nn.Linear(text_dim, 1)
 
     def forward(
-        self,
-        content_BKC: Tensor,
-        state: SlotState,
-        words_BLC: Tensor,
-        mask_BL: Tensor,
-        acting_BK: Tensor | None = None,
+        self, content_BKC: Tensor, state: SlotState, words_BLC: Tensor, mask_BL: Tensor, acting_BK: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Which slot each word names, and whether it names one that acts.
 
         Args:
             content_BKC: of the slots, standardised.
-            state: of the slots.
             words_BLC: embeddings of the words, each without the others.
             acting_BK: which slots act, where that is known.
 
@@ -107,9 +95,8 @@ class Appearance(nn.Module):
 def acting_loss(shares_BKL: Tensor, names_BL: Tensor, acting_BK: Tensor, known_BK: Tensor) -> Tensor:
     """Cross-entropy of which slots act by the words against which slots did, a mean over those of which it is known."""
     with full_precision(shares_BKL.device):
-        left_BK = (
-            (1 - (names_BL[:, None] * shares_BKL.exp()).clamp(max=1 - 1e-4)).log().sum(2)
-        )  # ln P(does not act)
+        # ln P(does not act)
+        left_BK = (1 - (names_BL[:, None] * shares_BKL.exp()).clamp(max=1 - 1e-4)).log().sum(2)
         acts_BK = (1 - left_BK.exp()).clamp_min(1e-6).log()
         loss_BK = -torch.where(acting_BK, acts_BK, left_BK.clamp_min(-14))
         return (loss_BK * known_BK).sum() / known_BK.sum().clamp_min(1)

@@ -42,8 +42,7 @@ class PredictorConfig:
     hidden: int = 1024  # width within each feed-forward net
     attention: Literal["window", "causal"] = "window"  # see the module
     window: int = 10  # the longest past in frames; for `causal` also the longest rollout
-    # Of time codes, one per frame for all its slots.
-    age_encoding: Literal["learned", "sinusoidal"] = "learned"
+    age_encoding: Literal["learned", "sinusoidal"] = "learned"  # of time codes, one per frame for all its slots
     residual: bool = True  # predict the change of the slots instead of the slots
     feed_forwards: Literal[1, 2] = 2  # nets in a layer: 2 as in the authors' code, 1 as in the paper's text
     # Read and change content in units of its deviation over the training slots. The published model does not; explicit
@@ -86,8 +85,7 @@ class SlotPredictor(nn.Module):
     """
 
     Config: ClassVar[type[PredictorConfig]]
-    # Whether the text changes the prediction, and so whether there is attention to it.
-    uses_text: ClassVar[bool]
+    uses_text: ClassVar[bool]  # whether the text changes the prediction, and so whether there is attention to it
 
     content_mean_C: Tensor
     content_std_C: Tensor
@@ -126,9 +124,7 @@ class SlotPredictor(nn.Module):
         """A new layer."""
 
     @abstractmethod
-    def _transform(
-        self, x_BTKC: Tensor, state: RolloutState, newest_only: bool
-    ) -> tuple[Tensor, Tensor | None]:
+    def _transform(self, x_BTKC: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor | None]:
         """Apply the layers to one token for each slot of T frames, the last ones of `state.unused_BMK`.
 
         Returns:
@@ -222,9 +218,7 @@ class SlotPredictor(nn.Module):
         context = self._text_context(text, seed_BTKD, acting_BK)
         return RolloutState(context, caches, self.layout.used(seed_BTKD[:, :0]))
 
-    def _predict(
-        self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool
-    ) -> tuple[Tensor, Tensor | None]:
+    def _predict(self, slots_BTKD: Tensor, state: RolloutState, newest_only: bool) -> tuple[Tensor, Tensor | None]:
         """The slots after every frame (B, T, K, D), or only after the newest (B, 1, K, D), and its attention."""
         start, T = state.cached, slots_BTKD.shape[1]
         unused_BTK = ~self.layout.used(slots_BTKD)

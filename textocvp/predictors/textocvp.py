@@ -33,9 +33,7 @@ class TextOCVPConfig(PredictorConfig):
 
     def __post_init__(self) -> None:
         if self.color_bias and self.appearance:
-            raise ValueError(
-                "predictor.appearance and predictor.color_bias exclude each other: set one to false"
-            )
+            raise ValueError("predictor.appearance and predictor.color_bias exclude each other: set one to false")
 
 
 class TextContext(NamedTuple):
@@ -73,18 +71,14 @@ class TextOCVPPredictor(SlotPredictor):
         shares_BKL, acts_BL = self._matched(text, slots_BKD, None)
         return acting_loss(shares_BKL, acts_BL, acting_BK, known_BK)
 
-    def _matched(
-        self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _matched(self, text: TextTokens, slots_BKD: Tensor, acting_BK: Tensor | None) -> tuple[Tensor, Tensor]:
         assert self.appearance is not None
         state = SlotState.split(slots_BKD, self.layout)
         content_BKC = (state.content - self.content_mean_C) / self.content_std_C
         words_BLC = text.embeddings_BLC if text.words_BLC is None else text.words_BLC
         return self.appearance(content_BKC, state, words_BLC, text.mask_BL, acting_BK)
 
-    def _text_context(
-        self, text: TextTokens, slots_BTKD: Tensor, acting_BK: Tensor | None = None
-    ) -> TextContext:
+    def _text_context(self, text: TextTokens, slots_BTKD: Tensor, acting_BK: Tensor | None = None) -> TextContext:
         match_BKL, slots_BKD = None, slots_BTKD[:, -1]
         if self.appearance is not None:
             match_BKL = Appearance.bias(*self._matched(text, slots_BTKD[:, 0], acting_BK))

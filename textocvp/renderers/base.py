@@ -38,8 +38,7 @@ class Seen:
     """What a renderer keeps of the first frame of one sequence, H and W its side: a multiple of the model's."""
 
     frame_3HW: Tensor  # -1..1
-    # The same without robot and things; what they hide is filled in from what they do not.
-    clean_3HW: Tensor
+    clean_3HW: Tensor  # the same without robot and things; what they hide is filled in from what they do not
     labels_HW: Tensor  # the number of the slot that each pixel belongs to, int64
     slots_KD: Tensor  # the slots of that frame
 
@@ -61,9 +60,7 @@ class Renderer(nn.Module):
         """Only the masks (B, K, H, W), for callers that look at no colours: a planner scores masks."""
         return self(slots_BKD).masks_BKHW
 
-    def remember(
-        self, frames_B3HW: Tensor, attention_BKhw: Tensor, slots_BKD: Tensor
-    ) -> tuple[Seen, ...] | None:
+    def remember(self, frames_B3HW: Tensor, attention_BKhw: Tensor, slots_BKD: Tensor) -> tuple[Seen, ...] | None:
         """What it keeps of B first frames, to draw the rest of each sequence with: `forward(slots_TKD, seen)`.
 
         Args:

@@ -124,9 +124,7 @@ class CarryRenderer(GlimpseRenderer):
         offset = torch.tensor([NOTHING, 0.0, 0.0, 0.0], device=cells_B4hw.device)[:, None, None]
         cells_B14hw = (cells_B4hw.to(offset.dtype) - offset)[:, None]
         picture_B4HW = paste(cells_B14hw, own.position, own.scale, size, size, self.extent)[:, 0] + offset
-        return torch.cat(
-            [picture_B4HW[:, :1].masked_fill(own.is_unused[..., None], NOTHING), picture_B4HW[:, 1:]], 1
-        )
+        return torch.cat([picture_B4HW[:, :1].masked_fill(own.is_unused[..., None], NOTHING), picture_B4HW[:, 1:]], 1)
 
     def _onto(self, state: SlotState, seen: Seen) -> Rendered:
         """The frames of T sets of slots (T, K) that go on from one first frame."""
@@ -180,9 +178,7 @@ class CarryRenderer(GlimpseRenderer):
 
         def draw_objects() -> Tensor:
             own_TKHW = slot_THW[:, None] == slots_K[:, None, None]
-            objects_TK3HW = torch.where(
-                own_TKHW[:, :, None], frames_T3HW[:, None], state.color[..., None, None]
-            )
+            objects_TK3HW = torch.where(own_TKHW[:, :, None], frames_T3HW[:, None], state.color[..., None, None])
             objects_TK3HW[:, ROBOT_SLOT] = robot_T3HW
             return objects_TK3HW
 

@@ -62,9 +62,7 @@ class RecallRenderer(GlimpseRenderer):
         # Each pixel gets what was wrong with the pixel of its slot that was in its place of the slot.
         t_T11 = torch.arange(T, device=slots.device)[:, None, None]
         y_HW, x_HW = torch.meshgrid(*(torch.arange(n, device=slots.device) for n in (H, W)), indexing="ij")
-        from_x_THW, from_y_THW = (
-            grid - shift_TK2[t_T11, slot_THW, axis] for axis, grid in enumerate((x_HW, y_HW))
-        )
+        from_x_THW, from_y_THW = (grid - shift_TK2[t_T11, slot_THW, axis] for axis, grid in enumerate((x_HW, y_HW)))
         inside_THW = (from_x_THW >= 0) & (from_x_THW < W) & (from_y_THW >= 0) & (from_y_THW < H)
         from_x_THW, from_y_THW = from_x_THW.clamp(0, W - 1), from_y_THW.clamp(0, H - 1)
         known_THW = inside_THW & (labels_HW[from_y_THW, from_x_THW] == slot_THW)
@@ -73,9 +71,7 @@ class RecallRenderer(GlimpseRenderer):
         own_KHW = F.one_hot(labels_HW, slots.shape[1]).permute(2, 0, 1).float()
         near_KHW = F.max_pool2d(own_KHW, 2 * BORDER + 1, 1, BORDER)
         left_THW = (moved_TK @ near_KHW.flatten(1)).unflatten(1, (H, W)) > 0
-        share_THW = self._alike(state, before)[t_T11, slot_THW] * (
-            known_THW & ~(left_THW & (slot_THW == labels_HW))
-        )
+        share_THW = self._alike(state, before)[t_T11, slot_THW] * (known_THW & ~(left_THW & (slot_THW == labels_HW)))
         correction_T3HW = correction_3HW[:, from_y_THW, from_x_THW].transpose(0, 1) * share_THW[:, None]
         return Rendered(drawn.frames_B3HW + correction_T3HW, drawn.masks_BKHW, drawn.draw_objects)
 
@@ -97,9 +93,7 @@ class RecallRenderer(GlimpseRenderer):
 
     def _alike(self, state: SlotState, before: SlotState) -> Tensor:
         """How much of the correction is left (T, K): 1 for a slot whose picture is as it was."""
-        shading_TKN, first_KN = (
-            self.decoder(x.content).unflatten(-1, (2, -1))[..., 1, :] for x in (state, before)
-        )
+        shading_TKN, first_KN = (self.decoder(x.content).unflatten(-1, (2, -1))[..., 1, :] for x in (state, before))
         change_TK = (shading_TKN - first_KN).abs().mean(-1)
         grown_TK = (state.scale / before.scale).log().abs().amax(-1)
         alike_TK = torch.exp(-(change_TK / CHANGED).square() - (grown_TK / 0.2).square())

@@ -32,9 +32,7 @@ class UpsampleRenderer(Renderer):
         self.image_size = image_size
         count = (image_size // CELLS).bit_length() - 1  # of doublings
         wide = 2 * config.channels
-        self.cells = nn.Sequential(
-            nn.Linear(layout.dim, wide * CELLS**2), nn.Unflatten(1, (wide, CELLS, CELLS))
-        )
+        self.cells = nn.Sequential(nn.Linear(layout.dim, wide * CELLS**2), nn.Unflatten(1, (wide, CELLS, CELLS)))
         blocks: list[nn.Module] = []
         for doubling in range(count - 1):
             width = config.channels if doubling == count - 2 else wide

@@ -37,8 +37,7 @@ class TextTokens:
     """A batch of encoded sentences."""
 
     embeddings_BLC: Tensor  # contextual; zero where there is no token
-    # True where there is a token: a word, or for the pretrained encoders a subword or end mark.
-    mask_BL: Tensor
+    mask_BL: Tensor  # True where there is a token: a word, or for the pretrained encoders a subword or end mark
     colors_BL3: Tensor  # RGB in -1..1 of the colour that a word names (`lexicon` only; zeros elsewhere)
     names_color_BL: Tensor  # True where `colors_BL3` means something
     words_BLC: Tensor | None = None  # each word without the others, from encoders that have such embeddings

@@ -18,14 +18,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from textocvp.layers import full_precision
-from textocvp.pretrained import (
-    CONFIG_FILE,
-    TOKENIZER_FILE,
-    WEIGHTS_FILE,
-    PretrainedFiles,
-    WeightsError,
-    read_model,
-)
+from textocvp.pretrained import CONFIG_FILE, TOKENIZER_FILE, WEIGHTS_FILE, PretrainedFiles, WeightsError, read_model
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
 
 if TYPE_CHECKING:
@@ -43,12 +36,9 @@ class PretrainedTextConfig(TextConfig):
     """Options of `PretrainedEncoder`."""
 
     kind: Literal["t5", "minilm"] = "t5"
-    # Folder or hub id; empty for google-t5/t5-small from the hub, or the Python package of MiniLM.
-    weights: str = ""
-    # Keep the weights as they are and out of checkpoints; else they are fine-tuned and stored.
-    frozen: bool = True
-    # Of the frozen weights, set when they are first used; other weights are then an error.
-    fingerprint: str = ""
+    weights: str = ""  # folder or hub id; empty for google-t5/t5-small from the hub, or the Python package of MiniLM
+    frozen: bool = True  # keep the weights as they are and out of checkpoints; else they are fine-tuned and stored
+    fingerprint: str = ""  # of the frozen weights, set when they are first used; other weights are then an error
 
     def for_captions(self, captions: Iterable[str], vocabulary: Iterable[str] = ()) -> TextConfig:
         return replace(self, fingerprint="")  # a new encoder may have other weights
@@ -146,9 +136,7 @@ class PretrainedEncoder(TextEncoder):
             most = f"{config.kind} reads {longest} tokens at most"
             raise ValueError(f"text.max_tokens={config.max_tokens}: {most}")
         self.pad = self._architecture.pad_token_id
-        encoder = build_encoder(
-            self._architecture
-        )  # also where weights follow: a seed draws the rest as ever
+        encoder = build_encoder(self._architecture)  # also where weights follow: a seed draws the rest as ever
         if not stored and torch.get_default_device().type != "meta":  # where only shapes are asked for
             encoder.load_state_dict(build_encoder(self._architecture, folder).state_dict())
         self.frozen = FrozenStates(encoder) if config.frozen else None

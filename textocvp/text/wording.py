@@ -51,20 +51,11 @@ def compile_rules(rules: tuple[str, ...]) -> tuple[tuple[re.Pattern[str], str], 
 def _compiled(rule: str) -> tuple[re.Pattern[str], str]:
     left, arrow, right = (part.strip() for part in rule.partition("=>"))
     wordings, names = [" ".join(one.split()) for one in left.split("|")], _NAME.findall(left)
-    wrong = (
-        not arrow
-        or not all(wordings)
-        or len(set(names)) < len(names)
-        or set(_NAME.findall(right)) - set(names)
-    )
+    wrong = not arrow or not all(wordings) or len(set(names)) < len(names) or set(_NAME.findall(right)) - set(names)
     if wrong or (names and len(wordings) > 1) or set(_NAME.sub("", left + right)) & set("{}\\"):
-        raise ValueError(
-            f"{rule!r} is no rule: write 'wording | other wording => words' or 'a {{x}} => b {{x}}'"
-        )
+        raise ValueError(f"{rule!r} is no rule: write 'wording | other wording => words' or 'a {{x}} => b {{x}}'")
     # Longer wordings first: "on top of" is not to be read as "on".
     either = "|".join(re.escape(one) for one in sorted(wordings, key=len, reverse=True))
     if names:
-        return re.compile(re.sub(r"\\{([a-z]+)\\}", r"(?P<\1>.+)", f"^{either}$")), _NAME.sub(
-            r"\\g<\1>", right
-        )
+        return re.compile(re.sub(r"\\{([a-z]+)\\}", r"(?P<\1>.+)", f"^{either}$")), _NAME.sub(r"\\g<\1>", right)
     return re.compile(rf"(?<!\S)(?:{either})(?!\S)"), right

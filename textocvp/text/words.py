@@ -61,10 +61,8 @@ class WordsConfig(TextConfig):
     layers: int = 2
     heads: int = 4
     hidden: int = 256
-    # The words that have an embedding of their own, in the order of its rows.
-    vocabulary: tuple[str, ...] = ()
-    # Those that no training caption contained: their embeddings are still random.
-    untrained: tuple[str, ...] = ()
+    vocabulary: tuple[str, ...] = ()  # the words that have an embedding of their own, in the order of its rows
+    untrained: tuple[str, ...] = ()  # those that no training caption contained: their embeddings are still random
     # How other wordings become those of the captions: rules for `textocvp.text.wording.reword`.
     rewrites: tuple[str, ...] = ()
     # What the training captions looked like, with {} for a colour; none where nobody listed them.
@@ -210,9 +208,7 @@ class WordEncoder(TextEncoder):
     def nothing_said(self, text: str) -> str:
         known = [word for word in self.config.vocabulary if self.config.knows(word)]
         known += ["names of colours"] if self.words_have_rgb else []
-        return (
-            f"a text needs at least one word that the model knows, got {text!r}; it knows {', '.join(known)}"
-        )
+        return f"a text needs at least one word that the model knows, got {text!r}; it knows {', '.join(known)}"
 
     def _row_and_color(self, word: str) -> tuple[int, RGB | None]:
         if word in self._vocabulary:

@@ -43,21 +43,13 @@ class ClipTraining(TrainingSettings):
 
 @dataclass
 class Clips:
-    """What one update learns from.
+    """What one update learns from."""
 
-    Attributes:
-        frames_BTHW3: uint8.
-        seeds_B: one for each clip, for parsers that draw their first slots.
-        features_BTLF: of the frozen encoder, float16, where they are cached.
-        lit_BTHW3: the same frames under other light, uint8, and
-        labels_BTHW: what their pixels show, for parsers that are taught.
-    """
-
-    frames_BTHW3: Tensor
-    seeds_B: Tensor
-    features_BTLF: Tensor | None = None
-    lit_BTHW3: Tensor | None = None
-    labels_BTHW: Tensor | None = None
+    frames_BTHW3: Tensor  # uint8
+    seeds_B: Tensor  # one for each clip, for parsers that draw their first slots
+    features_BTLF: Tensor | None = None  # of the frozen encoder, float16, where they are cached
+    lit_BTHW3: Tensor | None = None  # the same frames under other light, uint8
+    labels_BTHW: Tensor | None = None  # what these show, for parsers that are taught
 
     def on(self, device: torch.device) -> tuple[Tensor, Tensor | None]:
         """Frames (B, T, 3, H, W) in -1..1 and features (B, T, L, F), both float32."""
@@ -94,13 +86,8 @@ class ClipReader:
         if self.teacher is not None:
             labels = self.teacher.labels(starts, frames[:, ::stride], stride)
             seeds = rng.integers(2**63, size=args.batch)[self.rows]
-            lit, seen = zip(
-                *map(relight, frames[:, ::stride], labels, map(np.random.default_rng, seeds)), strict=True
-            )
-            clips.lit_BTHW3, clips.labels_BTHW = (
-                torch.from_numpy(np.stack(lit)),
-                torch.from_numpy(np.stack(seen)),
-            )
+            lit, seen = zip(*map(relight, frames[:, ::stride], labels, map(np.random.default_rng, seeds)), strict=True)
+            clips.lit_BTHW3, clips.labels_BTHW = (torch.from_numpy(np.stack(part)) for part in (lit, seen))
         return clips
 
     def steps(self, run: Run, name: str) -> Iterator[tuple[int, Clips]]:
@@ -110,11 +97,7 @@ class ClipReader:
 
 
 def clip_reader(
-    run: Run,
-    args: ClipTraining,
-    episodes: Episodes,
-    encoder: FrozenEncoder | None,
-    teacher: Teacher | None = None,
+    run: Run, args: ClipTraining, episodes: Episodes, encoder: FrozenEncoder | None, teacher: Teacher | None = None
 ) -> ClipReader:
     """A reader of this process's clips; with `args.cache_features` the features of all episodes are computed first.
 

@@ -31,27 +31,17 @@ NO_MASKS = "the held-out episodes have no masks: only the redrawn frames are mea
 
 @dataclass(frozen=True)
 class ParserMetrics(Metrics):
-    """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval.
-
-    Attributes:
-        object_miou: IoU of drawn masks with objects, Hungarian matching a frame.
-        object_found: share of objects with an IoU above one half.
-        followed: share of the first frame's objects whose slot keeps them through the whole episode.
-        foreground_ari: adjusted Rand index without the background's pixels, the robot included.
-        psnr: of the redrawn frames, dB.
-        robot: IoU of the robot with the slot that covers it best.
-        left_out: why all but the PSNR are None; empty where they are not.
-    """
+    """Figures over whole episodes, each a mean over episodes with its 95 % bootstrap interval."""
 
     group: ClassVar[str] = "quality"
 
-    object_miou: Interval | None
-    object_found: Interval | None
-    followed: Interval | None
-    foreground_ari: Interval | None
-    psnr: Interval
-    robot: Interval | None = None
-    left_out: str = ""
+    object_miou: Interval | None  # IoU of drawn masks with objects, Hungarian matching a frame
+    object_found: Interval | None  # share of objects with an IoU above one half
+    followed: Interval | None  # share of the first frame's objects whose slot keeps them through the whole episode
+    foreground_ari: Interval | None  # adjusted Rand index without the background's pixels, the robot included
+    psnr: Interval  # of the redrawn frames, dB
+    robot: Interval | None = None  # IoU of the robot with the slot that covers it best
+    left_out: str = ""  # why all but the PSNR are None; empty where they are not
 
     def __str__(self) -> str:
         text = ", ".join(f"{name} {interval}" for name, interval in self.measured().items())

@@ -39,25 +39,16 @@ NO_PLACES = "slots have no explicit places: no instruction following"
 
 @dataclass(frozen=True)
 class InstructionFollowing(Metrics):
-    """Shares of held-out episodes.
-
-    Attributes:
-        original: the object that the episode's instruction moves ends where the instruction says.
-        other_target: the same with a sentence that moves the same object to another one.
-        wrong_text: given any other sentence, the first object still ends where the instruction says.
-        error_px: median distance between where that object ends in the rollout and in the episode, pixels of 64.
-        grounded: both objects of the instruction have a slot in the first frame (the ceiling of the first two).
-        episodes: how many were tried.
-    """
+    """Shares of held-out episodes."""
 
     group: ClassVar[str] = "following"
 
-    original: float
-    other_target: float
-    wrong_text: float
-    error_px: float
-    grounded: float
-    episodes: int
+    original: float  # the object that the episode's instruction moves ends where the instruction says
+    other_target: float  # the same with a sentence that moves the same object to another one
+    wrong_text: float  # given any other sentence, the first object still ends where the instruction says
+    error_px: float  # median distance between where that object ends in the rollout and in the episode, pixels of 64
+    grounded: float  # both objects of the instruction have a slot in the first frame (the ceiling of the first two)
+    episodes: int  # how many were tried
 
     def __str__(self) -> str:
         return (
@@ -69,18 +60,13 @@ class InstructionFollowing(Metrics):
 
 @dataclass(frozen=True)
 class SlotErrors(Metrics):
-    """How far imagined slots are from parsed ones, a mean over episodes with its 95 % bootstrap interval.
+    """How far imagined slots are from parsed ones, a mean over episodes with its 95 % bootstrap interval."""
 
-    Attributes:
-        error: distance of the places of slots that move, pixels of 64; without explicit places the root mean square
-            error of all numbers of all slots. None where nothing moves.
-        still_error: what it would be if nothing moved.
-        left_out: why instruction following was not measured.
-    """
-
+    # Distance of the places of slots that move, pixels of 64; without explicit places the root mean square error
+    # of all numbers of all slots. None where nothing moves.
     error: Interval | None
-    still_error: Interval | None
-    left_out: str
+    still_error: Interval | None  # what it would be if nothing moved
+    left_out: str  # why instruction following was not measured
 
     def __str__(self) -> str:
         return f"slot error {self.error}, if nothing moved {self.still_error} ({self.left_out})"
@@ -88,24 +74,16 @@ class SlotErrors(Metrics):
 
 @dataclass(frozen=True)
 class Outcomes(Metrics):
-    """How well the ends of sentences are foreseen from their beginnings.
-
-    Attributes:
-        right: share of held-out episodes in which every slot ends where it should.
-        error_px: median distance of slots that move from where they end, pixels of 64.
-        episodes: how many were tried.
-    """
+    """How well the ends of sentences are foreseen from their beginnings."""
 
     group: ClassVar[str] = "outcomes"
 
-    right: float
-    error_px: float
-    episodes: int
+    right: float  # share of held-out episodes in which every slot ends where it should
+    error_px: float  # median distance of slots that move from where they end, pixels of 64
+    episodes: int  # how many were tried
 
     def __str__(self) -> str:
-        return (
-            f"all ends right {self.right:.3f}, median error {self.error_px:.2f} px ({self.episodes} episodes)"
-        )
+        return f"all ends right {self.right:.3f}, median error {self.error_px:.2f} px ({self.episodes} episodes)"
 
 
 @dataclass(frozen=True)
@@ -157,9 +135,7 @@ class HeldOut:
     trials: Trials
 
     @classmethod
-    def of(
-        cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, every: int = 1
-    ) -> HeldOut:
+    def of(cls, episodes: Episodes, slots: FrameCache, layout: SlotLayout, frames: int, every: int = 1) -> HeldOut:
         """Held-out episodes at a length of so many frames, counting every `every`-th."""
         rng, trials = np.random.default_rng(0), Trials()
         for index in range(len(episodes)) if layout.explicit else ():
@@ -169,8 +145,7 @@ class HeldOut:
                 continue
             state = SlotState.split(torch.from_numpy(slots.episode(index)[0].astype(np.float32)), layout)
             slot_of = {
-                item.id: slot_at(state, *place_and_size(truth.segmentation[0] == item.label))
-                for item in truth.objects
+                item.id: slot_at(state, *place_and_size(truth.segmentation[0] == item.label)) for item in truth.objects
             }
             trials.add(index, played, truth.questions, slot_of, rng)
         return cls(padded(slots, frames, every).float(), episodes.instructions, layout, trials)
@@ -196,10 +171,8 @@ def measure_outcomes(model: TextOCVP, held: HeldOut, count: int | None = None) -
     true_E2KD = held.slots_ETKD[:count]
     foreseen = _imagine(model, true_E2KD, held.instructions[:count], model.outcome)
     foreseen_EKD = torch.cat(list(foreseen))
-    true, position_EK2 = (
-        SlotState.split(true_E2KD, held.layout),
-        SlotState.split(foreseen_EKD, held.layout).position,
-    )
+    true = SlotState.split(true_E2KD, held.layout)
+    position_EK2 = SlotState.split(foreseen_EKD, held.layout).position
     error_EK = (position_EK2 - true.position[:, 1]).norm(dim=-1)
     thing_EK = true.is_thing[:, 0, :, 0]
     moves_EK = thing_EK & ((true.position[:, 1] - true.position[:, 0]).norm(dim=-1) > MOVES)
@@ -237,10 +210,7 @@ def _following(model: TextOCVP, held: HeldOut, count: int | None) -> Instruction
         reached = []
         imagined = _imagine(model, slots_NTKD, [trial.text for trial in asked])
         for trial, imagined_SKD in zip(asked, imagined, strict=True):
-            ends_K2, true_TK2 = (
-                SlotState.split(imagined_SKD[-1], held.layout).position,
-                places_ETK2[trial.episode],
-            )
+            ends_K2, true_TK2 = SlotState.split(imagined_SKD[-1], held.layout).position, places_ETK2[trial.episode]
             found = trial.moves >= 0 and trial.ends_at >= 0
             away = float((ends_K2[trial.moves] - true_TK2[0, trial.ends_at]).norm())
             reached.append(found and away < REACHED)
@@ -250,9 +220,7 @@ def _following(model: TextOCVP, held: HeldOut, count: int | None) -> Instruction
                     errors.append(float((ends_K2[trial.moves] - true_TK2[-1, trial.moves]).norm()))
         shares[kind] = _share(reached)
     error_px = float(np.median(errors)) / PIXEL if errors else math.nan
-    return InstructionFollowing(
-        **shares, error_px=error_px, grounded=_share(both_found), episodes=len(both_found)
-    )
+    return InstructionFollowing(**shares, error_px=error_px, grounded=_share(both_found), episodes=len(both_found))
 
 
 def _slot_errors(model: TextOCVP, held: HeldOut, count: int | None) -> SlotErrors:

@@ -48,9 +48,7 @@ def _grain(height: int, width: int, rng: np.random.Generator) -> NDArray[np.floa
     few, many = int(rng.integers(2, 8)), int(rng.integers(20, 84))
     sizes = (few, many) if rng.random() < 0.5 else (many, few)
     coarse = rng.standard_normal(sizes)
-    return ndimage.zoom(
-        coarse, (height / sizes[0], width / sizes[1]), order=1, grid_mode=True, mode="nearest"
-    )
+    return ndimage.zoom(coarse, (height / sizes[0], width / sizes[1]), order=1, grid_mode=True, mode="nearest")
 
 
 def jpeg(picture_HW3: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:

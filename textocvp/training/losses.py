@@ -22,21 +22,13 @@ UNIT = 0.03  # position errors are counted in these, about a pixel of 64: quadra
 
 @dataclass
 class ParserLoss:
-    """The terms of stage 1, each a scalar, 0 where a model has nothing to compare.
+    """The terms of stage 1, each a scalar, 0 where a model has nothing to compare."""
 
-    Attributes:
-        image: `image_loss` of the redrawn frames.
-        mask: `mask_loss`.
-        place: `place_loss`; for slots without explicit places `read_place_loss`.
-        feature: mean squared error of the reconstructed features.
-        lesson: what a parser that is taught gets wrong.
-    """
-
-    image: Tensor
-    mask: Tensor
-    place: Tensor
-    feature: Tensor
-    lesson: Tensor
+    image: Tensor  # `image_loss` of the redrawn frames
+    mask: Tensor  # `mask_loss`
+    place: Tensor  # `place_loss`; for slots without explicit places `read_place_loss`
+    feature: Tensor  # mean squared error of the reconstructed features
+    lesson: Tensor  # what a parser that is taught gets wrong
 
     def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
@@ -63,9 +55,7 @@ def image_loss(rendered: Rendered, target: Tensor, weights: Tensor, whole: Tenso
     return (weights * (rendered.frames_B3HW - target).square()).sum() / (3 * whole)
 
 
-def mask_loss(
-    rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None
-) -> Tensor:
+def mask_loss(rendered: Rendered, attention_BKHW: Tensor, weights: Tensor, whole: Tensor | None = None) -> Tensor:
     """Weighted cross-entropy of the drawn masks against the attention's winners (self-distillation, as in SPOT, 2024).
 
     No gradient enters the attention. `weights` and `whole` are as in `image_loss`.
@@ -96,17 +86,11 @@ def read_place_loss(position_BK2: Tensor, scale_BK2: Tensor, attention_BKHW: Ten
 
 @dataclass
 class SlotLoss:
-    """The terms of stage 2, each a scalar averaged over slots.
+    """The terms of stage 2, each a scalar averaged over slots."""
 
-    Attributes:
-        position: Huber loss of the centre, in units of about a pixel.
-        scale: squared error of the log-scale, in tenths.
-        content: squared error of the content, or of the whole slot if it has no explicit channels.
-    """
-
-    position: Tensor
-    scale: Tensor
-    content: Tensor
+    position: Tensor  # Huber loss of the centre, in units of about a pixel
+    scale: Tensor  # squared error of the log-scale, in tenths
+    content: Tensor  # squared error of the content, or of the whole slot if it has no explicit channels
 
     def total(self, scale_weight: float, content_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
@@ -114,11 +98,7 @@ class SlotLoss:
 
 
 def slot_loss(
-    predicted_BTKD: Tensor,
-    target_BTKD: Tensor,
-    weights_BTK: Tensor,
-    layout: SlotLayout,
-    content_std_C: Tensor | None,
+    predicted_BTKD: Tensor, target_BTKD: Tensor, weights_BTK: Tensor, layout: SlotLayout, content_std_C: Tensor | None
 ) -> SlotLoss:
     """Compare predicted slots with the parser's.
 
@@ -180,9 +160,7 @@ def acting(slots_BTKD: Tensor, layout: SlotLayout, content_std_C: Tensor) -> tup
     return acting_BK, acting_BK | (turned_BKC.square().mean(-1) > TURNS) & things_BK
 
 
-def drawn_loss(
-    renderer: Renderer, predicted_BSKD: Tensor, drawn_BF: NDArray[np.int64], true_BF3HW: Tensor
-) -> Tensor:
+def drawn_loss(renderer: Renderer, predicted_BSKD: Tensor, drawn_BF: NDArray[np.int64], true_BF3HW: Tensor) -> Tensor:
     """Mean squared error of the frames `drawn_BF` of the S predicted ones; its gradient flows through the renderer."""
     slots_BFKD = predicted_BSKD[torch.arange(len(drawn_BF))[:, None], torch.from_numpy(drawn_BF)]
     frames = renderer(slots_BFKD.flatten(0, 1)).frames_B3HW

@@ -22,21 +22,14 @@ from torch import Tensor, nn
 
 from textocvp.config import with_settings
 from textocvp.data.episodes import Episodes
-from textocvp.drawing import color_masks
 from textocvp.model import TextOCVP
 from textocvp.parsers.votes import VotesParser
+from textocvp.pictures import color_masks
 from textocvp.presets import preset
 from textocvp.slots import SlotState
 from textocvp.training.clips import ClipTraining, clip_reader, save_samples, to_pictures
 from textocvp.training.evaluate_parser import ParserMetrics, measure_own_frames, measure_parser
-from textocvp.training.losses import (
-    ParserLoss,
-    image_loss,
-    mask_loss,
-    place_loss,
-    read_place_loss,
-    thing_weights,
-)
+from textocvp.training.losses import ParserLoss, image_loss, mask_loss, place_loss, read_place_loss, thing_weights
 from textocvp.training.run import Run, SettingsError, allowed_settings, close_run, open_data, open_run
 from textocvp.training.teacher import Teacher
 
@@ -100,9 +93,7 @@ class ParserStage(nn.Module):
             redraw: whether there is anything to learn beside the lesson.
         """
         zero = frames_BT3HW.new_zeros(())
-        taught = (
-            zero if lesson is None else weight * self.parser.lesson_loss(*(x.flatten(0, 1) for x in lesson))
-        )
+        taught = zero if lesson is None else weight * self.parser.lesson_loss(*(x.flatten(0, 1) for x in lesson))
         if not redraw:
             return ParserLoss(zero, zero, zero, zero, taught)
         known = {} if features_BTLF is None else {"features_BTLF": features_BTLF}
@@ -196,9 +187,7 @@ def go_on_from(model: TextOCVP, checkpoint: Path) -> None:
     """Give parser and renderer the weights of a checkpoint; a SettingsError if it was built otherwise."""
     source = TextOCVP.from_pretrained(str(checkpoint))
     if (source.config.parser, source.config.renderer) != (model.config.parser, model.config.renderer):
-        raise SettingsError(
-            f"{checkpoint} is built otherwise: give the same preset and set as it was trained with"
-        )
+        raise SettingsError(f"{checkpoint} is built otherwise: give the same preset and set as it was trained with")
     model.parser.load_state_dict(source.parser.state_dict())
     model.renderer.load_state_dict(source.renderer.state_dict())
 

@@ -34,13 +34,7 @@ from textocvp.predictors.base import SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import WordBatch
 from textocvp.text.words import WordsConfig
-from textocvp.training.evaluate_predictor import (
-    HeldOut,
-    InstructionFollowing,
-    Outcomes,
-    SlotErrors,
-    measure_outcomes,
-)
+from textocvp.training.evaluate_predictor import HeldOut, InstructionFollowing, Outcomes, SlotErrors, measure_outcomes
 from textocvp.training.losses import acting, drawn_loss, moving_weights, slot_loss
 from textocvp.training.run import (
     Run,
@@ -126,9 +120,7 @@ class PredictorStage(nn.Module):
         if only_words:
             return given_BTKD[:, :0], words_loss
         if not self.predictor.config.causal:
-            return self.predictor.rollout(
-                given_BTKD, text, imagined + 1, acting_BK=told
-            ).slots_BSKD, words_loss
+            return self.predictor.rollout(given_BTKD, text, imagined + 1, acting_BK=told).slots_BSKD, words_loss
         if imagined:
             with torch.no_grad():
                 imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined, acting_BK=told).slots_BSKD
@@ -194,9 +186,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
             )
         batches = SlotBatches(slots, layout, model.text, frames, every, device=accelerator.device)
         std_C = predictor.content_std_C if predictor.standardized else None
-        if (
-            std_C is not None and not args.finetune
-        ):  # which keeps the units in which the predictor was trained
+        if std_C is not None and not args.finetune:  # which keeps the units in which the predictor was trained
             mean_C, deviation_C = batches.content_statistics()
             predictor.content_mean_C.copy_(mean_C)
             std_C.copy_(deviation_C)
@@ -236,9 +226,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
                 total = loss.total(args.scale_weight, args.content_weight) + args.words_weight * words_loss
                 if args.image_weight > 0:
                     times_BF = every * (first + drawn_BF[rows])
-                    true_BF3HW = true_frames(
-                        episodes, batch.episodes_B[rows], times_BF, batch.channels_B3[rows]
-                    )
+                    true_BF3HW = true_frames(episodes, batch.episodes_B[rows], times_BF, batch.channels_B3[rows])
                     image = drawn_loss(model.renderer, predicted_BSKD, drawn_BF[rows], true_BF3HW)
                     total = total + args.image_weight * run.weight(rows) * image
                 run.backward(total, vars(loss) | ({} if told is None else {"words": words_loss}))
@@ -285,9 +273,7 @@ def assemble(
             config = replace(config, name=chosen.name, text=chosen.text, predictor=chosen.predictor)
         for setting in args.set:
             if not setting.startswith(("predictor.", "text.")):
-                raise SettingsError(
-                    f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only"
-                )
+                raise SettingsError(f"{setting!r}: parser and renderer come trained; set predictor.* and text.* only")
         with allowed_settings():
             config = with_settings(config, args.set)
             text = config.text.for_captions(captions, vocabulary)
@@ -306,13 +292,9 @@ def with_outcome(args: PredictorTraining, trained: TextOCVP) -> TextOCVP:
     """
     config = trained.config
     if config.stage == "parser" or args.preset is not None:
-        raise SettingsError(
-            f"--outcome goes with a trained predictor, which {args.parser} must have, and no preset"
-        )
+        raise SettingsError(f"--outcome goes with a trained predictor, which {args.parser} must have, and no preset")
     if args.finetune and (config.outcome is None or args.set):
-        raise SettingsError(
-            "--finetune --outcome goes on with an outcome that is there, as it is: leave out set"
-        )
+        raise SettingsError("--finetune --outcome goes on with an outcome that is there, as it is: leave out set")
     for setting in args.set:
         if not setting.startswith("outcome."):
             raise SettingsError(f"{setting!r}: with --outcome set outcome.* only")
@@ -343,17 +325,13 @@ def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
     config, predictor = with_settings(model.config, settings), model.predictor
     old, new = model.config.predictor, config.predictor
     if new.window < old.window:
-        raise ValueError(
-            f"the window can grow, not shrink: it is {old.window} frames, {new.window} were asked for"
-        )
+        raise ValueError(f"the window can grow, not shrink: it is {old.window} frames, {new.window} were asked for")
     model.config, predictor.config = config, new
     if new.age_encoding == "learned":
         # The codes of new frames start as the last one that training reached. The published form has one code more
         # than its window has frames: no training ever reached that one.
         reached = predictor.ages.detach()[: old.window]
-        predictor.ages = nn.Parameter(
-            torch.cat([reached, reached[-1:].expand(new.time_codes - old.window, -1)])
-        )
+        predictor.ages = nn.Parameter(torch.cat([reached, reached[-1:].expand(new.time_codes - old.window, -1)]))
     else:
         codes = sinusoids(new.time_codes, new.dim).to(predictor.ages.device)
         predictor.register_buffer("ages", codes, persistent=False)

@@ -27,12 +27,7 @@ from typing import Any, ClassVar, Literal, TextIO, TypeVar
 
 import numpy as np
 import torch
-from accelerate import (
-    Accelerator,
-    DataLoaderConfiguration,
-    DistributedDataParallelKwargs,
-    InitProcessGroupKwargs,
-)
+from accelerate import Accelerator, DataLoaderConfiguration, DistributedDataParallelKwargs, InitProcessGroupKwargs
 from accelerate.state import AcceleratorState
 from safetensors import SafetensorError
 from torch import Tensor, nn
@@ -192,12 +187,7 @@ class Metrics:
 M = TypeVar("M", bound=Metrics)
 
 
-def open_run(
-    out: Path,
-    precision: Literal["no", "bf16", "fp16"],
-    *,
-    some_unused: bool = False,
-) -> Accelerator:
+def open_run(out: Path, precision: Literal["no", "bf16", "fp16"], *, some_unused: bool = False) -> Accelerator:
     """An accelerator that logs to `out`/logs: one process, or one of those that `accelerate launch` started.
 
     Until `close_run`, or until the process ends however that may be, no other process can open a run there.
@@ -247,9 +237,7 @@ def _lock(out: Path) -> None:
         lock.close()
         if error.errno not in (errno.EACCES, errno.EAGAIN):
             return  # a file system without locks
-        raise SettingsError(
-            f"{out} is being trained by another process: wait, or choose another --out"
-        ) from None
+        raise SettingsError(f"{out} is being trained by another process: wait, or choose another --out") from None
     _locks[out.absolute()] = lock
 
 
@@ -340,10 +328,7 @@ class Run:
     def steps(self, name: str) -> Iterator[int]:
         """The numbers of the steps that are left. Saves the state when it is time to, and at the end.
 
-        On SIGTERM the step is finished, the state saved and the program left with status 143.
-
-        Args:
-            name: of the progress bar.
+        On SIGTERM the step is finished, the state saved and the program left with status 143. `name` is on the bar.
         """
         first, total, hidden = self.first, self.args.steps, not self.accelerator.is_main_process
         self._bar = tqdm(range(first, total), name, initial=first, total=total, unit="step", disable=hidden)
@@ -491,11 +476,7 @@ def save_state(accelerator: Accelerator, out: Path, next_step: int) -> None:
         accelerator.save_state(str(new))
         if accelerator.is_main_process:
             (new / STEP_FILE).write_text(json.dumps({"next_step": next_step}))
-    except (
-        OSError,
-        RuntimeError,
-        SafetensorError,
-    ) as error:  # several libraries write, each fails in its own way
+    except (OSError, RuntimeError, SafetensorError) as error:  # several libraries write, each fails in its own way
         shutil.rmtree(new, ignore_errors=True)
         said = str(error).partition("\n")[0]
         raise OSError(

@@ -44,15 +44,11 @@ class Backdrop:
 
 @dataclass
 class Teacher:
-    """Says what the pixels of clips show: 0 background, 1 robot, 2 and more one for each object.
+    """Says what the pixels of clips show: 0 background, 1 robot, 2 and more one for each object."""
 
-    Attributes:
-        kind: `video` takes masks from the video itself, `masks` those that come with the episodes.
-        episodes: where the clips are from.
-    """
-
+    # `video` takes masks from the video itself, `masks` those that come with the episodes.
     kind: Literal["video", "masks"]
-    episodes: Episodes
+    episodes: Episodes  # where the clips are from
     _backdrops: dict[int, Backdrop] = field(default_factory=dict)
 
     def labels(self, starts: NDArray[np.int64], frames_BTHW3: NDArray[np.uint8], stride: int) -> Labels:

@@ -105,9 +105,7 @@ class AxialTransformer(nn.Module):
         super().__init__()
         C, p = config.dim, config.patch
         if grid % p or C % p**2:
-            raise ValueError(
-                f"axial.patch={p} does not divide {grid} codes along a side, or its square axial.dim={C}"
-            )
+            raise ValueError(f"axial.patch={p} does not divide {grid} codes along a side, or its square axial.dim={C}")
         if text_dim != C:
             raise ValueError(f"text.dim is {text_dim}, but must be axial.dim, which is {C}")
         self.config = config
@@ -188,9 +186,7 @@ class AxialTransformer(nn.Module):
         return scores_BTggPK.scatter_add(-1, kept_BTggP2, bonus_BTggP2)
 
     @torch.no_grad()
-    def imagine(
-        self, seen_BThw: Tensor, text: TextTokens, horizon: int, speed_B: Tensor | None = None
-    ) -> Tensor:
+    def imagine(self, seen_BThw: Tensor, text: TextTokens, horizon: int, speed_B: Tensor | None = None) -> Tensor:
         """The likeliest codes (B, horizon, h, w) of the frames after T seen ones, each fed back (greedy decoding).
 
         Args:

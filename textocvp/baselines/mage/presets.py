@@ -27,9 +27,7 @@ MAGE_PRESETS: dict[str, MageConfig] = {
     ),
     # The paper's MAGE-DINO at its own sizes (CLIPort, 336x336: 24x24 patches, one seed frame and 19 predicted).
     "mage-dino": MageConfig(
-        name="mage-dino",
-        vqvae=VQVAEConfig(image_size=336, encoder="dinov2", channels=1024),
-        text=PUBLISHED_TEXT,
+        name="mage-dino", vqvae=VQVAEConfig(image_size=336, encoder="dinov2", channels=1024), text=PUBLISHED_TEXT
     ),
 }
 

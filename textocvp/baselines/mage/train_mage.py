@@ -162,9 +162,7 @@ def assemble(args: MageTraining, vqvae: VQVAE, episodes: Episodes) -> Mage:
     return model
 
 
-def cached_codes(
-    model: VQVAE, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1
-) -> FrameCache:
+def cached_codes(model: VQVAE, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1) -> FrameCache:
     """The codes (h, w) uint16 of every frame, kept in `folder`; processes share the work as in `FrameCache.fill`.
 
     Raises:

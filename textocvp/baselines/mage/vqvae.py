@@ -17,12 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from textocvp.checkpoint import (
-    CheckpointError,
-    load_checkpoint,
-    read_json,
-    write_checkpoint,
-)
+from textocvp.checkpoint import CheckpointError, load_checkpoint, read_json, write_checkpoint
 from textocvp.config import build
 from textocvp.layers import full_precision
 from textocvp.parsers.dino import DINO_HUB_ID, DinoEncoder
@@ -44,9 +39,7 @@ class VQVAEConfig:
     blocks: int = 2  # residual blocks of the encoder, and of the decoder (`conv` only)
     codebook_size: int = 512
     code_dim: int = 256
-    encoder_weights: str = (
-        ""  # folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub
-    )
+    encoder_weights: str = ""  # folder or hub id of the frozen encoder; empty for facebook/dinov2-base from the hub
     encoder_dim: int = 768  # width of its features
     encoder_patch: int = 14  # side of its patches in pixels
     encoder_fingerprint: str = ""  # of its weights, set when they are first used; others are then an error
@@ -62,9 +55,7 @@ class Quantized:
     """The codes nearest to features."""
 
     codes_Nhw: Tensor  # their numbers
-    vectors_NhwC: (
-        Tensor  # themselves; their gradient goes straight through to the features, not to the codebook
-    )
+    vectors_NhwC: Tensor  # themselves; their gradient goes straight through to the features, not to the codebook
     codebook_loss: Tensor  # mean squared distance of codes and features; moves the codes only (VQ term)
     commitment_loss: Tensor  # the same number; moves the features only
 

@@ -51,10 +51,9 @@ def save_film(
     beside: np.ndarray | None = None,
     fps: int = 6,
 ) -> Path:
-    """Write sequences as a film or a strip; see `Rollout.save`.
+    """Write sequences as a film or a strip; see `Rollout.save`. Missing folders are made.
 
     Args:
-        path: missing folders are made.
         frames: (B, T, 3, H, W) RGB 0..1.
         masks: (B, T, K, H, W).
         texts: B captions, or none.

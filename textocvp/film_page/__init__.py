@@ -105,7 +105,7 @@ def run_lengths(labels_THW: np.ndarray) -> list[int]:
 
 def asset(name: str) -> str:
     """A file beside this one."""
-    return files("textocvp").joinpath(name).read_text(encoding="utf-8")
+    return files("textocvp.film_page").joinpath(name).read_text(encoding="utf-8")
 
 
 def with_films(page: str) -> str:

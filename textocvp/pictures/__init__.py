@@ -1,0 +1,6 @@
+"""Pictures: those that come in from files, and those that are drawn of rollouts."""
+
+from textocvp.pictures.draw import SUFFIXES, color_masks, save_film, slot_palette
+from textocvp.pictures.read import bring_to_size, read_picture
+
+__all__ = ["SUFFIXES", "bring_to_size", "color_masks", "read_picture", "save_film", "slot_palette"]
