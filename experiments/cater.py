@@ -24,20 +24,23 @@ import torch
 
 from envs.cater import Clip as Actions
 from envs.cater import Thing, draw_acts
+from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Line, Paper, TableSpec
 from experiments.study.any_size import Seen, drawn, film, imagine, mask_curves
+from experiments.study.attention import glow
 from experiments.study.cater import CaterScene, Judged, cater_scenes, judge
 from experiments.study.clips import extreme_clips
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import Model, lines
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import Prediction, hold_last
+from experiments.study.predictions import Prediction, hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from textocvp.data.episodes import Episode, EpisodeObject
 from textocvp.metrics import object_ious
+from textocvp.slots import SlotState
 
 SPLIT = "test"
 SIDE = 64
@@ -218,6 +221,47 @@ class Film:
         )
 
 
+COLUMNS = ("size", "colour", "material", "shape", "action", "cell x", "cell y")
+
+
+@dataclass(frozen=True)
+class Attention:
+    """A unit of work: ours imagined, a row an action, with each slot as bright as its share of attention to a word."""
+
+    scene: CaterScene
+    seed: int
+
+    def run(self, worker: Worker) -> Clip:
+        """Imagine it once more; a word that a sentence lacks is a dark panel."""
+        text, model = self.scene.clip().instruction, worker.world_model
+        first = self.scene.watch(SIDE)[0][0]
+        rollout = model.rollout(first, [text], horizon=LENGTHS["clip"], seed=self.seed, attention=True)
+        assert rollout.attention is not None
+        frames, masks = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
+        things_1K1 = SlotState.split(rollout.slots[:, 0], rollout.layout).is_thing  # the floor's slot stays dark
+        shares_TKW = (rollout.attention[0].double().mean((1, 2)) * things_1K1).cpu().numpy()
+        dark = np.zeros_like(frames)
+        glowing = [
+            [dark if word is None else glow(frames, masks, shares_TKW[..., word]) for word in row]
+            for row in shown_words(model.words(text))
+        ]
+        panels, name = ("imagined", *COLUMNS), f"cater-attention-{self.scene.seed}.gif"
+        return Clip(name, gif([[frames, *row] for row in glowing]), panels, text, f"seed {self.scene.seed}")
+
+
+def shown_words(words: Sequence[str]) -> list[list[int | None]]:
+    """For each sentence of a caption, the places of the words of `COLUMNS`."""
+    starts = [k - 5 for k, word in enumerate(words) if word == "is"]
+    rows: list[list[int | None]] = []
+    for begin, end in zip(starts, [*starts[1:], len(words)], strict=True):
+        said = words[begin:end]
+        acts = [k for k, word in enumerate(said) if word in ("rotating", "sliding", "placed", "containing")]
+        numbers = [k for k, word in enumerate(said) if word.lstrip("-").isdigit()]
+        places = [1, 2, 3, 4, *acts[:1], *numbers, None, None]
+        rows.append([None if place is None else begin + place for place in places[: len(COLUMNS)]])
+    return rows
+
+
 def units(run: Run) -> dict[str, Part]:
     """The scenes."""
     models = tuple(model for model in run.models if f"{model.key}=" in "".join(run.args.model))
@@ -225,7 +269,8 @@ def units(run: Run) -> dict[str, Part]:
         CaterUnit(scene, run.sizes.variants, models, run.measures, run.args.seed)
         for scene in cater_scenes(run.sizes.scenes, run.args.seed)
     ]
-    return {"scenes": Part(work, 8.0), "films": Part(seconds=2.0, count=2 * run.sizes.clips)}
+    films = Part(seconds=2.0, count=2 * run.sizes.clips)
+    return {"scenes": Part(work, 8.0), "films": films, "attention": Part(seconds=2.0, count=run.sizes.clips)}
 
 
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
@@ -237,7 +282,8 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
         for scene, value in zip(scenes, values, strict=True)
     ]
     badness = [-value if metric == "ssim" else value for value in values]
-    return {"films": extreme_clips(films, badness, run.sizes.clips)}
+    attention = [Attention(scene, run.args.seed) for scene in scenes[: run.sizes.clips]]
+    return {"films": extreme_clips(films, badness, run.sizes.clips), "attention": attention}
 
 
 def headline(run: Run) -> dict[str, Key]:
@@ -301,6 +347,11 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             [control],
         ),
         Section("Films", ranked, [Clips(found["films"])]),
+        Section(
+            "What the words point at",
+            "Each thing as bright as its share of attention to a word, a mean over layers and heads; a row an action.",
+            [Clips(found["attention"])],
+        ),
         Section("What is absent", " ".join(run.remarks) or "Nothing."),
     ]
 

@@ -1,4 +1,4 @@
-"""Robustness: what is lost when colours or the number of objects are new?
+"""Robustness: what is lost when colours, the number of objects, the light or the words are new?
 
     python experiments/robustness.py              # default: some minutes on 2 cores
     python experiments/robustness.py --quick      # a first look
@@ -29,7 +29,7 @@ from experiments.study.frame_metrics import available_measures as available
 from experiments.study.judge import judge_rollout
 from experiments.study.mask_metrics import labels_of, score_masks
 from experiments.study.methods import BASELINES, HORIZON, METHODS, PLANNERS, TRAINED_LITTLE, Model, lines
-from experiments.study.pictures import CHANGES, ChangedScene, change_rows, change_tables
+from experiments.study.pictures import CHANGES, WORDS, ChangedScene, change_rows, change_tables
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
@@ -157,14 +157,14 @@ def units(run: Run) -> dict[str, Part]:
         if method in ("ours", "expert") or i < sizes.controls
     ]
     changed = [
-        ChangedScene(scene, change, seed)
-        for scene in study_scenes(REFERENCE, sizes.changed, seed)
-        for change in CHANGES
+        ChangedScene(scene, change, seed, words, number)
+        for number, scene in enumerate(study_scenes(REFERENCE, sizes.changed, seed))
+        for change, words in product(CHANGES, WORDS)
     ]
     return {
         "frames and masks": Part(scenes, 2.8),
         "closed loop": Part(episodes, 0.25),
-        "other light": Part(changed, 0.04),
+        "other light and words": Part(changed, 0.04),
         "imagined clips": Part(seconds=1.4, count=2 * min(sizes.clips, sizes.imagined)),
         "robot clips": Part(seconds=0.3, count=sizes.acted),
     }
@@ -258,7 +258,7 @@ def rows(run: Run, found: Found) -> list[Row]:
         for o in found["closed loop"]
     )
     first, last = ([row for one in its.items() for row in rows_of(*one)] for its in (imagined, acted))
-    return [*first, *difference_rows(imagined), *last, *change_rows(found["other light"])]
+    return [*first, *difference_rows(imagined), *last, *change_rows(found["other light and words"])]
 
 
 def headline(run: Run) -> dict[str, Key]:
@@ -383,7 +383,10 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     best, worst = best_and_worst(found["imagined clips"])
     ranked = f"By whether ours shows what was asked, then by its {name} at {LENGTHS[-1]} frames."
     watched = "Failures where there are any. Left: each chosen plan, imagined. Right: the camera."
-    light = "The test set's first pictures, changed. The true masks say which slots are block and bowl."
+    light = (
+        "The test set's first pictures, changed, and its sentences, reworded: another verb, preposition, noun, order, "
+        "politeness, capitals for each scene. The true masks say which slots are block and bowl."
+    )
     judged = "Dots with 95 % intervals over scenes, judged by the simulator."
     return [
         Section(
@@ -402,7 +405,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             Section(SPLITS[s].capitalize(), text, [spec.table(figures, missing) for spec in SPLIT_TABLES[s]])
             for s, text in texts.items()
         ),
-        Section("Other light", light, [spec.table(figures, missing) for spec in change_tables(REFERENCE)]),
+        Section("Other light, other words", light, [spec.table(figures, missing) for spec in change_tables(REFERENCE)]),
         Section("The best cases", f"{ranked} Below: masks, one colour a thing.", [Clips(best)]),
         Section("The worst cases", ranked, [Clips(worst)]),
         Section("Planned beside executed", watched, [Clips(found["robot clips"])]),

@@ -1,4 +1,4 @@
-"""The same scene in other light or through a worse camera: does the imagined block still reach the named bowl?"""
+"""The same scene in other light, through a worse camera or in other words: does the imagined block reach its bowl?"""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from experiments.report.tables import TableSpec, columns
 from experiments.study.methods import HORIZON, lines
 from experiments.study.pool import Worker
 from experiments.study.scenes import StudyScene, sample_scene
+from experiments.study.wordings import paraphrase
 from planning import Instruction, Thing
 from textocvp.inputs import ForeignPictureWarning
 from textocvp.metrics import overlaps
@@ -63,6 +64,12 @@ CHANGES: Mapping[str, Callable[[Picture, Mask, np.random.Generator], NDArray[Any
 }
 """Title of a column -> what is done to the first picture."""
 
+WORDS: Mapping[str, Callable[[int, str, str], str]] = {
+    "ours": lambda number, block, bowl: f"put the {block} block in the {bowl} bowl",
+    "ours, other words": paraphrase,
+}
+"""Line of a table -> the wording, of the scene's number and two colours."""
+
 
 @dataclass(frozen=True)
 class ChangedOutcome:
@@ -70,13 +77,14 @@ class ChangedOutcome:
 
     scene: StudyScene  # which
     change: str  # key of `CHANGES`
+    words: str  # key of `WORDS`
     reached: bool  # the imagined block ends within 6 pixels of 64 of the named bowl
     warned: bool  # the model said that the picture is not of its world
 
 
 @dataclass(frozen=True)
 class ChangedScene:
-    """A unit of work: one changed observation, imagined with the scene's own sentence.
+    """A unit of work: one changed observation, imagined with the scene's own sentence or with a paraphrase of it.
 
     The true masks say which slots hold the block and the bowl, as in `InstructionFollowing`: what is measured is the
     model, not the grounding by colour.
@@ -85,6 +93,8 @@ class ChangedScene:
     scene: StudyScene
     change: str
     seed: int
+    words: str = "ours"  # key of `WORDS`
+    number: int = 0  # of the scene, which decides the paraphrase
 
     def run(self, worker: Worker) -> ChangedOutcome:
         """Change, imagine, look where the block ends."""
@@ -92,10 +102,11 @@ class ChangedScene:
         rgb, labels_HW = sampled.observation["rgb"], sampled.info["segmentation"]
         table_HW = (labels_HW == 0) & (rgb == np.array(sampled.info["palette"]["table"])).all(-1)
         changed = change_picture(self.change, rgb, table_HW, np.random.default_rng([self.scene.seed, 4]))
+        asked = Instruction.parse(sampled.texts[0])
+        text = WORDS[self.words](self.number, asked.thing.color, asked.target.color)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            rollout = worker.world_model.rollout(changed, [sampled.texts[0]], horizon=HORIZON, seed=self.seed)
-        asked = Instruction.parse(sampled.texts[0])
+            rollout = worker.world_model.rollout(changed, [text], horizon=HORIZON, seed=self.seed)
         label_of = {Thing(item["color"], item["kind"]): item["label"] for item in sampled.info["objects"]}
         seen_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
         block, bowl = (_best_slot(seen_HW, labels_HW, label_of[one]) for one in (asked.thing, asked.target))
@@ -103,7 +114,7 @@ class ChangedScene:
         away = float((places_TK2[-1, block] - places_TK2[0, bowl]).norm())
         reached = min(block, bowl) >= 0 and away < REACHED / PIXEL
         warned = any(issubclass(one.category, ForeignPictureWarning) for one in said)
-        return ChangedOutcome(self.scene, self.change, reached, warned)
+        return ChangedOutcome(self.scene, self.change, self.words, reached, warned)
 
 
 def _best_slot(seen_HW: NDArray[np.int64], labels_HW: NDArray[np.uint8], label: int) -> int:
@@ -113,22 +124,22 @@ def _best_slot(seen_HW: NDArray[np.int64], labels_HW: NDArray[np.uint8], label: 
 
 
 def change_rows(outcomes: Sequence[ChangedOutcome]) -> list[Row]:
-    """For each split and change the share of scenes that reach the bowl, and the share that is warned of."""
-    found: dict[tuple[str, str], list[ChangedOutcome]] = {}
+    """For each wording, split and change the share of scenes that reach the bowl, and the share that is warned of."""
+    found: dict[tuple[str, str, str], list[ChangedOutcome]] = {}
     for one in outcomes:
-        found.setdefault((one.scene.split, one.change), []).append(one)
+        found.setdefault((one.words, one.scene.split, one.change), []).append(one)
     return [
-        rate_row("ours", *place, metric, [getattr(one, metric) for one in its])
+        rate_row(*place, metric, [getattr(one, metric) for one in its])
         for place, its in found.items()
         for metric in ("reached", "warned")
     ]
 
 
 def change_tables(split: str) -> list[TableSpec]:
-    """What `change_rows` makes of a split, a column a change."""
+    """What `change_rows` makes of a split, a column a change and a line a wording."""
     titles = {
         "reached": "The imagined block reaches the named bowl",
         "warned": "The model says that the picture is not of its world",
     }
     places = {change: (split, change) for change in CHANGES}
-    return [TableSpec(title, columns(metric, places), lines(["ours"])) for metric, title in titles.items()]
+    return [TableSpec(title, columns(metric, places), lines(WORDS)) for metric, title in titles.items()]

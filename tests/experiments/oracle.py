@@ -16,7 +16,9 @@ import torch
 from envs.tabletop import TabletopEnv
 from planning import PinholeCamera
 from tests.planning.oracle import ARM, OracleWorldModel
+from textocvp.presets import TABLETOP_REWRITES
 from textocvp.rollout import Rollout
+from textocvp.text.wording import reword
 from textocvp.world_model import Checkpoint
 
 _history: list[dict[str, Any]] = []
@@ -89,6 +91,7 @@ class StudyOracle:
         self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0
     ) -> Rollout:
         parsed = obs if isinstance(obs, Rollout) else self.parse(obs[None], seed=seed)
+        text = [" ".join(reword(one, TABLETOP_REWRITES)) for one in text]
         return self._oracle().rollout(parsed, text, horizon=horizon, seed=seed)
 
     def _oracle(self) -> OracleWorldModel:

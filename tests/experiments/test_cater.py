@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from envs.cater import Act, Clip, Thing
-from experiments.cater import STUDY, Args, Sizes
+from experiments.cater import STUDY, Args, Sizes, shown_words
 from experiments.report.results import Results
 from experiments.study.cater import CaterScene, cater_scenes, judge
 from experiments.study.frame_metrics import Measures
@@ -47,6 +48,16 @@ def test_what_really_happens_is_right(name) -> None:
         assert one.object is (None if act.to is None else True)
         assert one.place is (None if act.to is None else True)
         assert one.hidden is (None if act.into is None else True)
+
+
+def test_words_are_found_by_what_they_say() -> None:
+    clip, _ = shown(ACTS["contain"])
+    words = re.findall(r"-?\w+", clip.instruction)
+    rows = [[place if place is None else words[place] for place in row] for row in shown_words(words)]
+    assert rows == [
+        ["large", "red", "metal", "cone", "containing", None, None],
+        ["medium", "green", "rubber", "cube", "sliding", "2", "-3"],
+    ]
 
 
 def test_what_else_happens_is_wrong() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from experiments.robustness import (
 )
 from experiments.study.frame_metrics import Measures
 from experiments.study.methods import Model
-from experiments.study.pictures import CHANGES
+from experiments.study.pictures import CHANGES, WORDS
 from experiments.study.pool import Worker
 from experiments.study.run import Run, ScenesArgs, run
 from experiments.study.scenes import study_scenes
@@ -191,7 +192,8 @@ def test_the_study_as_a_whole(folder: Path) -> None:
     by_split = {r.split for r in found.rows if r.metric == "closed_loop_success" and r.method == "expert"}
     assert by_split == set(SPLITS)
     changed = [row for row in found.rows if row.metric == "reached"]
-    assert [row.variant for row in changed] == list(CHANGES) and {row.value for row in changed} == {1.0}
+    assert {(row.method, row.variant) for row in changed} == set(product(WORDS, CHANGES))
+    assert len(changed) == len(WORDS) * len(CHANGES) and {row.value for row in changed} == {1.0}
     test, unseen = (found.find("ours", "9 frames", "st_lpips", s) for s in ("test", "unseen_colors"))
     assert test is not None and unseen is not None
     assert found.headline["lpips_drop_unseen_colors"] == pytest.approx(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from envs.colors import COLORS
 from experiments.study.pictures import (
     CHANGES,
     UNCHANGED,
     WOOD,
+    WORDS,
     ChangedScene,
     change_picture,
     change_rows,
@@ -16,8 +18,11 @@ from experiments.study.pictures import (
 )
 from experiments.study.pool import Worker
 from experiments.study.scenes import study_scenes
+from experiments.study.wordings import paraphrase
 from planning import Instruction
-from tests.experiments.oracle import LoadOracle
+from tests.experiments.oracle import LoadOracle, StudyOracle
+from textocvp.presets import SMALL_TEXT
+from textocvp.text import build_text_encoder
 
 
 def changed(name: str, rgb_HW3: np.ndarray, seed: int = 0, table_HW: np.ndarray | None = None) -> np.ndarray:
@@ -76,14 +81,42 @@ def test_what_is_measured_is_where_the_block_ends(stubborn: bool) -> None:
     outcomes = [ChangedScene(scene, change, 0).run(worker) for change in (UNCHANGED, "light x 0.7")]
     assert [one.reached for one in outcomes] == [not stubborn] * 2 and not any(one.warned for one in outcomes)
     rows = change_rows(outcomes)
-    assert [(row.split, row.variant, row.metric, row.value, row.n) for row in rows] == [
-        ("val", change, metric, float(metric == "reached" and not stubborn), 1)
+    assert [(row.method, row.split, row.variant, row.metric, row.value, row.n) for row in rows] == [
+        ("ours", "val", change, metric, float(metric == "reached" and not stubborn), 1)
         for change in (UNCHANGED, "light x 0.7")
         for metric in ("reached", "warned")
     ]
     table = change_tables("val")[0].table(rows)
     assert tuple(table.columns) == tuple(CHANGES)
     assert [cell.text for cell in table.rows[0].cells[:2]] == ["0.00" if stubborn else "1.00"] * 2
+
+
+def test_other_words_are_imagined_and_judged_by_the_same_wish() -> None:
+    (scene,) = study_scenes("val", 1, 0)
+    heard: list[str] = []
+
+    class Deaf(StudyOracle):
+        """Understands no wording but the captions'."""
+
+        def rollout(self, obs, text, **how):
+            heard.extend(text)
+            self._stubborn = () if text[0].startswith("put the ") else tuple(COLORS)
+            return super().rollout(obs, text, **how)
+
+    LoadOracle()()  # which listens to the environment
+    worker = Worker(Deaf(()))
+    outcomes = [ChangedScene(scene, UNCHANGED, 0, words, 2).run(worker) for words in WORDS]
+    asked = Instruction.parse(heard[0])
+    assert heard[1] == paraphrase(2, asked.thing.color, asked.target.color) != heard[0]
+    assert [one.reached for one in outcomes] == [True, False]
+    assert [row.method for row in change_rows(outcomes)] == ["ours", "ours", "ours, other words", "ours, other words"]
+
+
+def test_every_paraphrase_is_a_wording_of_its_own_and_read_as_what_it_means() -> None:
+    encoder = build_text_encoder(SMALL_TEXT)
+    texts = [paraphrase(number, "gray", "light blue") for number in range(100)]
+    assert len(set(texts)) > 90 and texts[3] == paraphrase(3, "gray", "light blue")
+    assert {encoder.reads(text) for text in texts} == {"put the gray block in the light blue bowl"}
 
 
 def test_scenes_may_be_of_another_world() -> None:
