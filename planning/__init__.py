@@ -55,12 +55,15 @@ from .search import (
     seen_supports,
 )
 
+InstructionPlanner = BeamPlanner
+"""What the planner of goals of one instruction was called when it stood alone: programs of users say it."""
+
 __all__ = [
     "DEFAULT_CRITERION", "DEFAULT_SCORE", "RELATIONS", "THRESHOLDS", "AnyGoal", "AnySentencePlanner",
     "AppearanceGrounder", "Attempt", "BeamPlanner", "BelievingPlanner", "Candidate", "CarryScore", "Controller",
     "EpisodeResult", "Foresees", "Goal", "Grounder", "Grounding", "GroundingError", "Imagines", "Instruction",
-    "LiteralController", "LiteralPlanner", "Palette", "PickAndPlace", "PictureGoal", "PinholeCamera",
-    "PlacementScore", "Plan", "Planner", "RandomPlanner", "Relation", "Score", "SearchPlanner",
+    "InstructionPlanner", "LiteralController", "LiteralPlanner", "Palette", "PickAndPlace", "PictureGoal",
+    "PinholeCamera",     "PlacementScore", "Plan", "Planner", "RandomPlanner", "Relation", "Score", "SearchPlanner",
     "SegmentationGrounder", "SuccessCriterion", "Thing", "Thresholds", "Trace", "View", "Wanted", "WeightedSum",
     "ground", "ground_by_segmentation", "measure", "measure_rollout", "observe", "places", "run_episode",
     "seen_supports", "unmet", "watched_frames",

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+import planning
 from planning import (
     BeamPlanner,
     Controller,
@@ -122,3 +123,7 @@ def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera, grounder
     np.testing.assert_allclose(action.pick, (0.45, -0.12), atol=0.01)
     np.testing.assert_allclose(action.place, (0.42, 0.08), atol=0.01)
     assert action.to_action().dtype == np.float32 and action.to_action().shape == (4,)
+
+
+def test_programs_that_say_the_planners_old_name_go_on() -> None:
+    assert planning.InstructionPlanner is planning.BeamPlanner and "InstructionPlanner" in planning.__all__
