@@ -63,7 +63,7 @@ __all__ = [
     "AppearanceGrounder", "Attempt", "BeamPlanner", "BelievingPlanner", "Candidate", "CarryScore", "Controller",
     "EpisodeResult", "Foresees", "Goal", "Grounder", "Grounding", "GroundingError", "Imagines", "Instruction",
     "InstructionPlanner", "LiteralController", "LiteralPlanner", "Palette", "PickAndPlace", "PictureGoal",
-    "PinholeCamera",     "PlacementScore", "Plan", "Planner", "RandomPlanner", "Relation", "Score", "SearchPlanner",
+    "PinholeCamera", "PlacementScore", "Plan", "Planner", "RandomPlanner", "Relation", "Score", "SearchPlanner",
     "SegmentationGrounder", "SuccessCriterion", "Thing", "Thresholds", "Trace", "View", "Wanted", "WeightedSum",
     "ground", "ground_by_segmentation", "measure", "measure_rollout", "observe", "places", "run_episode",
     "seen_supports", "unmet", "watched_frames",
