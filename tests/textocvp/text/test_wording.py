@@ -29,6 +29,16 @@ SAME = [
     "Into the blue bowl, please place a red cube.",
     "pick up the red block and put it in the blue bowl",
     "take the red block and place it into the blue bowl",
+    "Pick up the red block. Put it in the blue bowl.",
+    "Take the red cube, then drop it into the blue dish",
+    "Grab the red block and set it down inside the blue bowl!",
+    "the red block should go into the blue bowl",
+    "I want the red block in the blue bowl",
+    "I'd like you to have the red block placed in the blue bowl.",
+    "to the blue bowl move the red block",
+    "put all of the red blocks in the blue bowl",
+    "Hi robot, would you mind putting the red block into the blue bowl? Thanks!",
+    "red block in blue bowl",
 ]
 
 
