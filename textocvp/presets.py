@@ -44,6 +44,7 @@ TABLETOP_REWRITES = (
     "into | inside | inside of | in to | within | down into => in",
     "onto | upon | atop | on top of => on",
     "them => it",
+    "put it down => put it",
     "up and put it | and then put it | and put it | then put it => put it",
     "take {thing} put it {place} => put {thing} {place}",
     "take {thing} => put {thing}",
