@@ -200,7 +200,7 @@ def draw_acts(
             act = _draw_act(rng, things, number, pair, first[1] if first and not acts else None)
             if act is not None:
                 acts.append(act)
-        if len(acts) == 2 and _free(Clip(things, tuple(acts))):
+        if len(acts) == 2 and free(Clip(things, tuple(acts))):
             return tuple(acts)
     return None
 
@@ -238,6 +238,12 @@ def _draw_place(rng: np.random.Generator, radius: float) -> Place:
     return float(x), float(y)
 
 
+def draw_times(rng: np.random.Generator) -> tuple[int, int]:
+    """Frames at which a motion begins and ends."""
+    start = int(rng.integers(LATEST_START + 1))
+    return start, int(rng.integers(start + SHORTEST, FRAMES + 1))
+
+
 def _draw_act(
     rng: np.random.Generator,
     things: tuple[Thing, ...],
@@ -246,8 +252,7 @@ def _draw_act(
     action: Action | None,
 ) -> Act | None:
     thing = things[number]
-    start = int(rng.integers(LATEST_START + 1))
-    stop = int(rng.integers(start + SHORTEST, FRAMES + 1))
+    start, stop = draw_times(rng)
     inside = [
         k
         for k, other in enumerate(things)
@@ -269,7 +274,7 @@ def _draw_act(
     return Act(number, action, start, stop, to)
 
 
-def _free(clip: Clip) -> bool:
+def free(clip: Clip) -> bool:
     """Whether no thing comes too near to another at any time."""
     radii = np.array([thing.radius for thing in clip.things])
     wide = radii[:, None] + radii + GAP

@@ -24,8 +24,9 @@ class PlayCommand:
 
     checkpoint: str | None = None
     """A bundled name, a folder, or a Hugging Face hub id owner/name; by default the one that knows the world."""
-    world: Literal["rearrange", "tabletop", "cliport"] = "rearrange"
-    """rearrange: blocks into bowls and onto blocks. tabletop: into bowls. cliport: the same on CLIPort's table."""
+    world: Literal["rearrange", "tabletop", "cliport", "cater"] = "rearrange"
+    """rearrange: blocks into bowls and onto blocks. tabletop: into bowls. cliport: the same on CLIPort's table. cater:
+    CATER's table, on which things move by themselves: scenes and captions, but nothing to arrange and no plans."""
     port: int = 7860
     """Where to listen; 0 takes a free one."""
     host: str = "127.0.0.1"
@@ -64,7 +65,7 @@ def serve(command: PlayCommand) -> None:
         from fastapi.middleware.trustedhost import TrustedHostMiddleware
 
         from experiments.play.server import create_app
-        from experiments.play.session import WORLDS
+        from experiments.play.worlds import WORLDS
     except ModuleNotFoundError as error:
         if error.name not in ("fastapi", "uvicorn"):
             raise
@@ -73,12 +74,12 @@ def serve(command: PlayCommand) -> None:
     from textocvp.world_model import WorldModel
 
     torch.set_num_threads(max(1, command.threads))
-    world = WORLDS[command.world]
+    choice = WORLDS[command.world]
     try:
-        world_model = WorldModel.from_pretrained(command.checkpoint or world.checkpoint)
+        world_model = WorldModel.from_pretrained(command.checkpoint or choice.checkpoint)
     except CheckpointError as error:
         raise Mistake(str(error)) from None
-    app = create_app(world_model, world, command.most_pages)
+    app = create_app(world_model, choice, command.most_pages)
     host, port = listening.getsockname()[:2]
     alone = is_loopback(host)
     shown = f"[{host}]" if ":" in host else host

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,9 +21,9 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from envs.colors import COLORS
-from envs.tasks.rearrange import FAMILIES
 from experiments.play.links import Link, Refused
-from experiments.play.session import HORIZON, Session, World, heard
+from experiments.play.session import Session, heard
+from experiments.play.worlds import Choice
 from planning import GroundingError
 from textocvp import WorldModel
 from textocvp.film_page import with_films
@@ -52,17 +53,23 @@ class Sessions:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, link: Link) -> tuple[str, Session]:
-        """A new page."""
+        """A new page. Others do not wait while its scene is built, which many acts may make long."""
         self.sweep()
+        name = secrets.token_urlsafe(12)
         with self.lock:
-            if len(self.open) >= self.most:
+            if len(self.heard_of) >= self.most:
                 raise Refused(
-                    f"{len(self.open)} pages are open, and no more may be (--most-pages {self.most}); close one"
+                    f"{self.most} pages are open, and no more may be (--most-pages {self.most}); close one"
                 )
-            name = secrets.token_urlsafe(12)
-            # Made while others wait, which takes milliseconds: so there are never too many.
-            self.open[name], self.heard_of[name] = self.make(link), time.monotonic()
-            return name, self.open[name]
+            self.heard_of[name] = inf  # which keeps its place
+        try:
+            session = self.make(link)
+        except BaseException:
+            self.close(name)
+            raise
+        with self.lock:
+            self.open[name], self.heard_of[name] = session, time.monotonic()
+        return name, session
 
     def get(self, name: str) -> Session:
         """An open page; Closed for one that is not."""
@@ -92,14 +99,17 @@ class Sessions:
             self.close(name)
 
 
-def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horizon: int = HORIZON) -> FastAPI:
+def create_app(
+    world_model: WorldModel, choice: Choice, most_pages: int = 8, horizon: int | None = None
+) -> FastAPI:
     """The application; its open pages are `app.state.sessions`.
 
     Args:
+        choice: the world to play in.
         most_pages: that may be open at once.
-        horizon: frames of a film.
+        horizon: frames of a film; by default those of the world.
     """
-    sessions = Sessions(lambda link: Session(world_model, world, link, horizon), most_pages)
+    sessions = Sessions(lambda link: Session(world_model, choice, link, horizon), most_pages)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -168,8 +178,7 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
         except (Refused, ValueError) as error:
             name, session = sessions.add(Link())  # says the same once more if there are too many pages
             problem = [str(error)]
-        about = {"model": repr(world_model), "plans": world_model.foresees}
-        about |= {"colors": list(COLORS), "families": list(FAMILIES) if session.base.task.stacks else []}
+        about = {"model": repr(world_model), "colors": list(COLORS), **session.about()}
         return {"page": name, "about": about, "problems": problem, "scene": session.view()}
 
     @app.post("/api/{name}/close")
@@ -188,15 +197,15 @@ def create_app(world_model: WorldModel, world: World, most_pages: int = 8, horiz
 
     @app.post("/api/{name}/move")
     def move(name: str, thing: Annotated[int, Body()], x: Number, y: Number) -> dict[str, Any]:
-        return ask(name, lambda session: session.move(thing, x, y))
+        return ask(name, lambda session: session.table.move(thing, x, y))
 
     @app.post("/api/{name}/remove")
     def remove(name: str, thing: Annotated[int, Body(embed=True)]) -> dict[str, Any]:
-        return ask(name, lambda session: session.remove(thing))
+        return ask(name, lambda session: session.table.remove(thing))
 
     @app.post("/api/{name}/add")
     def add(name: str, kind: Said, color: Said) -> dict[str, Any]:
-        return ask(name, lambda session: session.add(kind, color))
+        return ask(name, lambda session: session.table.add(kind, color))
 
     @app.post("/api/{name}/imagine")
     def imagine(name: str, texts: Annotated[list[str], Body(embed=True)]) -> dict[str, Any]:

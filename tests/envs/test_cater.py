@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from envs.cater import ACTIONS, Act, CaterConfig, Clip, Table, Thing, cell, draw_acts, draw_clip
+from envs.cater import ACTIONS, Act, CaterConfig, Clip, Table, Thing, cell, draw_acts, draw_clip, read_caption
 from envs.cater.scenes import FRAMES, LIFT, TABLE, hidden
 from envs.collect import Args, main
 from envs.dataset import collect
@@ -220,3 +220,64 @@ def test_the_command_line_names_what_does_not_go_together(tmp_path):
             "quadrant" in one or "rotating" in one or "containing" in one
             for one in file["episode/instruction"].asstr()[:]
         )
+
+
+# ---- captions that are read back
+
+
+def rewritten(clip: Clip, text: str, seed: int = 0) -> Clip:
+    return read_caption(text, clip.things, np.random.default_rng(seed))
+
+
+def test_captions_are_read_as_they_are_written(clips) -> None:
+    for clip in clips:
+        read = rewritten(clip, clip.instruction)
+        said, again = (sorted(one.instruction.removesuffix(".").split(". ")) for one in (clip, read))
+        assert again == said
+        loose = clip.ambiguous(np.random.default_rng(1))
+        read = rewritten(clip, loose)
+        for sentence, act in zip(
+            loose.split(". "), sorted(clip.acts, key=lambda act: act.thing), strict=True
+        ):
+            # What it says is true of one of the acts: the action, the words of the name, and the quadrant.
+            name = sentence.removeprefix("the ").split(" is ")[0].split()
+            kept = [
+                a
+                for a in read.acts
+                if a.action == act.action and {*name} <= {*clip.things[a.thing].name.split()}
+            ]
+            assert kept
+            if act.to is not None and act.into is None:
+                assert any((a.to[0] > 0, a.to[1] > 0) == (act.to[0] > 0, act.to[1] > 0) for a in kept if a.to)
+
+
+def test_a_caption_without_full_stop_or_of_one_sentence_is_read() -> None:
+    clip = Clip((thing(), thing("sphere", place=(2.0, 2.0))), ())
+    (act,) = rewritten(clip, "The red CUBE is sliding to -2, 2").acts
+    assert act.thing == 0 and cell(act.to) == (-2, 2)
+    assert rewritten(clip, "the cube is rotating", 3) == rewritten(clip, "the cube is rotating", 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "one or two sentences"),
+        ("the cube is rotating. the cube is rotating. the cube is rotating.", "not 3"),
+        ("put the red block in the bowl", "cannot read"),
+        ("the blue cube is rotating", "no blue cube is here; here are: medium red rubber cube"),
+        ("the sphere is rotating", "a sphere is never rotating"),
+        ("the cube is rotating. the red cube is sliding to (1, 1)", "different things"),
+        ("the cube is sliding to (0, 2)", "without 0"),
+        ("the cube is sliding", "cannot read"),
+        ("the cube is sliding to (2, 4)", "places are cells"),
+        ("the cube is sliding to the fifth quadrant", "quadrants"),
+        ("the cone is picked up and containing the cube", "contains smaller"),
+        ("the cone is picked up and containing", "no name is here"),
+        ("the cone is picked up and containing the sphere. the sphere is sliding to (1, 1)", "different things"),
+        ("the cube is sliding to (2, 2)", "pushing"),
+    ],
+)  # fmt: skip
+def test_what_no_caption_of_the_scene_is_gets_a_sentence(text, said) -> None:
+    things = (thing(), thing("sphere", "small", (1.5, 1.5)), thing("cone", "large", (-2.0, -2.0)))
+    with pytest.raises(ValueError, match=re.escape(said)):
+        rewritten(Clip(things, ()), text)

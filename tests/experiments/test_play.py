@@ -18,9 +18,14 @@ from typing import Any
 import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
+import pybullet
 import pytest
 from PIL import Image
 
+from envs.cater import Table
+from envs.splits import SPLITS
+from experiments.study.cater import CaterScene
+from planning import PinholeCamera
 from tests.textocvp.conftest import PLACED, build
 from textocvp import WorldModel, cli
 
@@ -29,9 +34,11 @@ TestClient = pytest.importorskip("fastapi.testclient", exc_type=ImportError).Tes
 from experiments.play import __main__ as command  # noqa: E402
 from experiments.play import server  # noqa: E402
 from experiments.play.links import Link, Refused  # noqa: E402
-from experiments.play.session import WORLDS, heard  # noqa: E402
+from experiments.play.session import Session, heard  # noqa: E402
+from experiments.play.worlds import WORLDS  # noqa: E402
 
 HORIZON = 24
+TABLE = Table(64).camera
 OCCUPIED = "seed=0&family=occupied"  # a brown block lies in the cyan bowl
 ASKED = "put the red block in the cyan bowl"
 
@@ -232,6 +239,14 @@ def test_a_picture_is_taken_as_the_project_takes_pictures(open_page) -> None:
     assert not page.ask("scene", query=OCCUPIED)["scene"]["own_picture"]
 
 
+def test_no_picture_is_taken_while_a_goal_is_arranged(open_page) -> None:
+    page = open_page(OCCUPIED)
+    Image.fromarray(pixels(page.scene["picture"])).save(buffer := io.BytesIO(), "PNG")
+    page.ask("goal", what="begin")
+    assert "being arranged" in upload(page, buffer.getvalue()).json()["error"]
+    assert page.ask("goal", what="cancel")["scene"] == page.opened["scene"]
+
+
 def test_a_wrong_picture_is_refused_in_a_sentence(open_page) -> None:
     page = open_page(OCCUPIED)
     before = page.scene
@@ -273,7 +288,7 @@ def test_pages_are_counted_and_closed(world_model) -> None:
         full = client.post("/api/open", json={"query": ""})
         assert full.status_code == 400 and "--most-pages 2" in full.json()["error"]
         sessions = client.app.state.sessions
-        env = sessions.get(first.name).env
+        env = sessions.get(first.name).world.env
         assert client.post(f"/api/{first.name}/close").status_code == 200
         with pytest.raises(gym.error.ClosedEnvironmentError):
             env.reset()
@@ -311,6 +326,38 @@ def test_one_page_does_not_wait_for_another(open_page, monkeypatch) -> None:
     # Neither hears the warnings of the other.
     assert len(other["films"]) == 1 and answers[0]["warnings"] == ["of the slow one"]
     assert other["warnings"] and "of the slow one" not in other["warnings"]
+
+
+def test_nobody_waits_for_a_page_that_is_opened(world_model) -> None:
+    """A link may repeat many acts."""
+    sessions = server.Sessions(lambda link: Session(world_model, WORLDS["tabletop"], link, 2), most=2)
+    make, begun, may_end = sessions.make, threading.Event(), threading.Event()
+    name, _ = sessions.add(Link())
+
+    def slowly(link: Link) -> Session:
+        begun.set()
+        assert may_end.wait(20)
+        return make(link)
+
+    sessions.make = slowly
+    opening = threading.Thread(target=lambda: sessions.add(Link(1)))
+    opening.start()
+    assert begun.wait(20)
+    asked = threading.Thread(target=lambda: sessions.get(name), daemon=True)
+    asked.start()
+    asked.join(5)
+    assert not asked.is_alive()
+    with pytest.raises(Refused, match="2 pages are open"):  # the one that is being opened has its place
+        sessions.add(Link(2))
+    may_end.set()
+    opening.join(20)
+    assert len(sessions.open) == 2
+    sessions.make = lambda link: (_ for _ in ()).throw(Refused("no such scene"))
+    for one in list(sessions.open):
+        sessions.close(one)
+    for _ in range(3):  # what cannot be opened takes no place
+        with pytest.raises(Refused, match="no such scene"):
+            sessions.add(Link())
 
 
 def test_memory_does_not_grow(world_model) -> None:
@@ -357,6 +404,118 @@ def test_warnings_outside_are_not_kept() -> None:
         warnings.warn("one", UserWarning, stacklevel=1)
     warnings.warn("two", UserWarning, stacklevel=1)
     assert sentences == ["one", "one"]
+
+
+# ---- CATER's world
+
+
+@pytest.fixture(scope="module")
+def cater_model() -> WorldModel:
+    return WorldModel.from_pretrained("cater")
+
+
+@pytest.fixture
+def open_cater(cater_model: WorldModel) -> Iterator[Callable[..., Page]]:
+    with TestClient(server.create_app(cater_model, WORLDS["cater"])) as client:
+        yield lambda query="": Page(client, query)
+
+
+def test_a_scene_of_cater_is_imagined_and_done_as_its_simulator_draws_it(open_cater, cater_model) -> None:
+    page = open_cater("seed=3")
+    about, scene = page.opened["about"], page.opened["scene"]
+    assert not about["edits"] and not about["plans"] and not about["families"]
+    truth = CaterScene("test", SPLITS["test"].seed(3))
+    frames, _ = truth.watch(64)
+    own = truth.clip().instruction
+    assert np.array_equal(pixels(scene["picture"]), frames[0])
+    assert scene["sentences"][0] == scene["task"] == own and len(set(scene["sentences"])) > 5
+    names = [one["name"] for one in scene["things"]]
+    assert len(set(names)) == len(names) == len(truth.clip().things)
+    assert all(0 < v < 64 for one in scene["things"] for v in one["at"])
+    # The thing stands where the page says: the pixel there is not the floor.
+    for one in scene["things"]:
+        x, y = map(int, one["at"])
+        assert np.ptp(frames[0][y, x].astype(int)) > 20, one
+    films = page.ask("imagine", texts=scene["sentences"][:2])["films"]
+    expected = cater_model.rollout(frames[0], scene["sentences"][:2], horizon=29, attention=True)
+    for row, film in enumerate(films):
+        imagined = expected.frames[row].permute(0, 2, 3, 1).mul(255).round().byte().numpy()
+        assert np.array_equal(pixels(film["frames"]).reshape(imagined.shape), imagined)
+        assert {one["name"] for one in film["slots"]} == {*names, "table"}
+        assert len(film["attention"][0][0]) == len(film["words"])
+    answer = page.ask("do", text=own.upper())
+    assert np.array_equal(pixels(answer["film"]["real"]).reshape(frames.shape), frames)
+    # Every caption begins from the same scene, and a link brings it back.
+    assert answer["scene"] == scene == open_cater(scene["link"]).opened["scene"]
+
+
+def test_a_caption_of_ones_own_is_done_and_the_same_again(open_cater) -> None:
+    page = open_cater("seed=3")
+    text = "The blue sphere is picked up and placed to (-1, 2)."
+    assert text not in page.scene["sentences"]
+    one, again = (page.ask("do", text=text)["film"]["real"] for _ in range(2))
+    assert one == again
+    real = pixels(one).reshape(-1, 64, 64, 3).astype(int)
+    blue = [np.argwhere(frame[..., 2] - frame[..., 0] > 60).mean(0) for frame in real]
+    goal = PinholeCamera(TABLE.intrinsics, TABLE.extrinsics).project(np.array([-0.5, 1.5, 0.25]))
+    assert np.hypot(*(blue[-1][::-1] - goal)) < 5  # a cell is about 9 pixels wide
+    assert min(y for y, _ in blue) < min(blue[0][0], blue[-1][0]) - 3  # it was lifted
+
+
+@pytest.mark.parametrize(
+    ("verb", "body", "said"),
+    [
+        ("scene", {"query": "seed=-1"}, "whole number"),
+        ("scene", {"query": "seed=10000000"}, "less than 10000000"),
+        ("scene", {"query": "family=plain"}, "a seed"),
+        ("scene", {"query": "layout=block,red,0.5,0,0.03,0"}, "a seed"),
+        ("scene", {"query": "acts=0.4,0,0.5,0"}, "a seed"),
+        ("do", {"text": "put the red block in the cyan bowl"}, "captions are like"),
+        ("do", {"text": "the pink cone is rotating."}, "no pink cone is here; here are: medium brown"),
+        ("do", {"text": "the blue sphere is sliding to (0, 9)"}, "without 0"),
+        ("move", {"thing": 0, "x": 1, "y": 1}, "stay as they are drawn"),
+        ("remove", {"thing": 0}, "stay as they are drawn"),
+        ("add", {"kind": "block", "color": "red"}, "stay as they are drawn"),
+        ("goal", {"what": "begin"}, "stay as they are drawn"),
+        ("plan", {"text": "put the red block in the cyan bowl"}, "no plans are made"),
+    ],
+)
+def test_what_makes_no_sense_in_cater_gets_a_sentence(open_cater, verb, body, said) -> None:
+    page = open_cater("seed=3")
+    before = page.scene
+    assert said in page.refused(verb, **body)
+    assert page.scene == before
+
+
+def test_a_picture_of_ones_own_in_cater_has_slots_with_numbers(open_cater) -> None:
+    page = open_cater("seed=3")
+    Image.fromarray(pixels(page.scene["picture"])).save(buffer := io.BytesIO(), "PNG")
+    own = page.scene["task"]
+    answer = upload(page, buffer.getvalue()).json()
+    assert not answer["warnings"] and answer["scene"]["own_picture"] and not answer["scene"]["sentences"]
+    (film,) = page.ask("imagine", texts=[own])["films"]
+    assert len(film["slots"]) == 5 and all(
+        re.fullmatch(r"table|slot \d+", one["name"]) for one in film["slots"]
+    )
+    assert "no simulator behind it" in page.refused("do", text=own)
+
+
+def test_what_was_imagined_keeps_its_names_when_another_scene_is_shown(open_cater) -> None:
+    page = open_cater("seed=3")
+    page.ask("imagine", texts=[page.scene["task"]])
+    page.ask("scene", query="seed=4")
+    sent = page.client.get(f"/api/{page.name}/film.html").text
+    (data,) = re.findall(r"const page = (.*);\n", sent)
+    assert "small blue metal sphere" in {one["name"] for one in json.loads(data)["films"][0]["slots"]}
+
+
+def test_a_closed_page_of_cater_frees_its_simulator(cater_model) -> None:
+    with TestClient(server.create_app(cater_model, WORLDS["cater"])) as client:
+        page = Page(client)
+        bullet = client.app.state.sessions.get(page.name).world.table.bullet.client
+        assert pybullet.isConnected(bullet)
+        client.post(f"/api/{page.name}/close")
+        assert not pybullet.isConnected(bullet)
 
 
 # ---- the command

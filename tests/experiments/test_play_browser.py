@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,11 @@ OCCUPIED = "?seed=0&family=occupied"  # the brown block lies in the cyan bowl
 WAIT = 20_000  # milliseconds, for machines that are busy
 
 
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Of a server in a process of its own, which ends at Ctrl-C without a traceback."""
+@contextmanager
+def served(*arguments: str) -> Iterator[str]:
+    """The address of a server in a process of its own, which ends at Ctrl-C without a traceback."""
     with subprocess.Popen(
-        [sys.executable, "-m", "experiments.play", "--no-browser", "--port", "0", "--most-pages", "3"],
+        [sys.executable, "-m", "experiments.play", "--no-browser", "--port", "0", *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -51,6 +52,18 @@ def address() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with served("--most-pages", "3") as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def cater() -> Iterator[str]:
+    with served("--world", "cater") as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
         started = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -63,7 +76,7 @@ def visit(browser: Any, address: str) -> Iterator[Callable[..., Any]]:
     """Open the page; at the end it must have asked no other host for anything, and its script had no error."""
     contexts, wrong = [], []
 
-    def visit(query: str = OCCUPIED, **options: Any) -> Any:
+    def visit(query: str = OCCUPIED, address: str = address, **options: Any) -> Any:
         contexts.append(browser.new_context(**options))
         page = contexts[-1].new_page()
         page.set_default_timeout(WAIT)
@@ -260,6 +273,140 @@ def test_dragging_asks_the_environment(visit) -> None:
     drag("white bowl", 0)
     expect(page.locator("#message")).to_contain_text("Done")
     assert page.locator("#scene").get_attribute("src") != before
+
+
+def names(page: Any) -> list[str]:
+    """Of the things in the scene, when nothing is waited for."""
+    expect(page.locator("#message.busy")).to_have_count(0)
+    return page.locator("#things button").all_inner_texts()
+
+
+def middle(page: Any, name: str) -> tuple[float, float]:
+    """Where a thing is on the screen."""
+    box = page.locator(f"#stage span[title='{name}']").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_what_is_dragged_out_of_the_picture_is_taken_away(visit) -> None:
+    page = visit()
+    before, box = names(page), page.locator("#scene").bounding_box()
+    page.mouse.move(*middle(page, "white bowl"))
+    page.mouse.down()
+    # At the edge it is still moved, and the environment's checks answer.
+    page.mouse.move(box["x"] + 0.97 * box["width"], box["y"] + 1.02 * box["height"], steps=4)
+    expect(page.locator("#stage span.leaving")).to_have_count(0)
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 1.3 * box["height"], steps=4)
+    expect(page.locator("#stage span.leaving")).to_have_count(1)
+    page.mouse.up()
+    expect(page.locator("#stage span")).to_have_count(5)
+    assert names(page) == [one for one in before if one != "white bowl"]
+    expect(page.locator("#stage span.leaving")).to_have_count(0)
+    # What lies in a bowl is grasped, not the bowl.
+    page.mouse.move(*middle(page, "brown block"))
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 1.3 * box["height"], steps=4)
+    page.mouse.up()
+    expect(page.locator("#stage span")).to_have_count(4)
+    assert "brown block" not in names(page) and "cyan bowl" in names(page)
+
+
+def test_a_finger_moves_things_and_takes_them_away(visit) -> None:
+    page = visit(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
+    finger = page.context.new_cdp_session(page)
+
+    def drag(name: str, x: float, y: float) -> None:
+        at = middle(page, name)
+        points = [(at[0] + (x - at[0]) * k / 5, at[1] + (y - at[1]) * k / 5) for k in range(6)]
+        for kind, point in zip(["touchStart"] + 5 * ["touchMove"], points, strict=True):
+            touch = {"type": kind, "touchPoints": [dict(zip("xy", point, strict=True))]}
+            finger.send("Input.dispatchTouchEvent", touch)
+        finger.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        expect(page.locator("#message")).to_contain_text("Done")
+
+    before, box = names(page), page.locator("#scene").bounding_box()
+    drag("white bowl", box["x"] + box["width"] / 2, box["y"] + box["height"] + 60)
+    expect(page.locator("#stage span")).to_have_count(5)
+    x, y = box["x"] + 0.3 * box["width"], box["y"] + 0.4 * box["height"]
+    drag("red block", x, y)
+    at = middle(page, "red block")
+    assert abs(at[0] - x) < 12 and abs(at[1] - y) < 12 and page.evaluate("scrollY") == 0
+    # Tapped, and taken away with the button: one only, even if it is tapped twice.
+    page.locator("#stage span[title='yellow bowl']").tap()
+    away = page.get_by_role("button", name="take away")
+    away.tap()
+    expect(page.locator("#stage span")).to_have_count(4)
+    away.tap()
+    expect(page.locator("#message.bad")).to_contain_text("Choose a thing first")
+    assert names(page) == [one for one in before if one not in ("white bowl", "yellow bowl")]
+
+
+def test_sentences_about_what_is_gone_are_replaced_and_others_stay(visit) -> None:
+    own = "please put the red cube in the gray bowl"
+    page = visit(OCCUPIED + "&say=put+the+red+block+in+the+white+bowl&say=" + own.replace(" ", "+"))
+    first, second = page.get_by_label("sentence").all()
+    assert [first.input_value(), second.input_value()] == ["put the red block in the white bowl", own]
+    page.get_by_role("button", name="white bowl").focus()
+    page.keyboard.press("Delete")
+    expect(page.locator("#stage span")).to_have_count(5)
+    possible = page.locator("#possible option").evaluate_all("all => all.map(one => one.value)")
+    assert first.input_value() in possible and second.input_value() == own
+    # The next thing is chosen, so that the keyboard can go on.
+    expect(page.get_by_role("button", name="gray bowl")).to_be_focused()
+
+
+def test_cater_shows_scenes_and_captions_and_nothing_to_arrange(visit, cater) -> None:
+    page = visit("?seed=3", cater)
+    for gone in ("plan", "add", "take away", "arrange the goal"):
+        expect(page.get_by_role("button", name=gone, exact=True)).not_to_be_visible()
+    captions = page.locator("#possible option").evaluate_all("all => all.map(one => one.value)")
+    assert len(captions) > 5 and page.get_by_label("sentence").input_value() == captions[0]
+    # Dragging and keys move nothing.
+    page.get_by_role("button", name="small blue metal sphere").focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Delete")
+    page.mouse.move(*middle(page, "small blue metal sphere"))
+    page.mouse.down()
+    page.mouse.move(10, 10, steps=3)
+    page.mouse.up()
+    expect(page.locator("#message")).to_contain_text("Ready")
+    assert len(names(page)) == 4
+    press(page, "another sentence")
+    press(page, "imagine")
+    expect(page.locator(".film")).to_have_count(2)
+    expect(page.get_by_role("button", name="medium brown metal sphere 2")).to_have_count(3)  # of two alike
+    page.get_by_label("sentence").first.fill("the blue sphere is sliding to (-1, 2)")
+    press(page, "do it")
+    expect(page.get_by_text("what happened", exact=True)).to_have_count(1)
+    page.get_by_label("moment").fill("29")
+    assert drawn(page, "difference")[..., :3].any() and drawn(page, "what happened").shape == (64, 64, 4)
+    # The address brings scene and sentence back.
+    again = visit("?" + page.url.split("?")[1], cater)
+    assert again.locator("#scene").get_attribute("src") == page.locator("#scene").get_attribute("src")
+    assert again.get_by_label("sentence").first.input_value() == "the blue sphere is sliding to (-1, 2)"
+    assert "goal" not in page.url
+    # Another scene has captions of its own.
+    press(page, "another")
+    expect(page.locator("#message")).to_contain_text("Done")
+    now = page.locator("#possible option").evaluate_all("all => all.map(one => one.value)")
+    assert now != captions and page.get_by_label("sentence").nth(1).input_value() in now
+    page.locator("#seed").fill("1e9")
+    press(page, "show")
+    expect(page.locator("#message.bad")).to_contain_text("must be a whole number")
+
+
+def test_films_of_cater_can_be_downloaded(visit, cater) -> None:
+    page = visit("?seed=4", cater, viewport={"width": 390, "height": 800}, has_touch=True)
+    assert (
+        page.locator(".whole").inner_text() == page.get_by_label("sentence").input_value()
+    )  # too long for its field
+    press(page, "do it")
+    expect(page.locator(".film")).to_have_count(1)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    for kind, starts in (("GIF", b"GIF8"), ("MP4", b"ftyp"), ("page to send", b"<!doctype html>")):
+        with page.expect_download() as download:
+            press(page, kind)
+        data = Path(download.value.path()).read_bytes()
+        assert starts in data[:20] and len(data) > 5000
 
 
 def test_a_goal_is_arranged(visit) -> None:

@@ -1,0 +1,99 @@
+"""CATER's table: no robot, scenes by number, and captions that the simulator carries out as they are said."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from envs.cater import Clip, Table, read_caption
+from envs.cater.record import clip_of
+from envs.cater.scenes import FRAMES
+from envs.splits import SEEDS_PER_SPLIT, SPLITS
+from experiments.play.links import Link, Refused
+from experiments.study.cater import CaterScene
+from planning import PinholeCamera
+from textocvp import Rollout
+from textocvp.film_page import slot_names
+from textocvp.metrics import object_ious
+
+SPLIT = "test"  # scenes that no model was trained on
+CAPTIONS = 8  # that are proposed of a scene
+OVERLAP = 0.3  # of a slot with a thing that gives it its name
+
+
+class Cater:
+    """A `World` of scenes as they are drawn. Every caption begins from the scene as it is shown."""
+
+    horizon = FRAMES - 1
+    families: tuple[str, ...] = ()
+
+    def __init__(self, image_size: int) -> None:
+        self.table = Table(image_size)
+        self.link = Link()
+
+    def close(self) -> None:
+        """Give the simulator back."""
+        self.table.close()
+
+    def show(self, link: Link) -> None:
+        """Draw the scene of a link, which has a seed and nothing else."""
+        if link != Link(link.seed):
+            raise Refused("scenes of this world have a seed, and neither a family nor a layout nor acts")
+        if link.seed >= SEEDS_PER_SPLIT:
+            raise Refused(f"the seeds of this world are less than {SEEDS_PER_SPLIT}, not {link.seed}")
+        seed = SPLITS[SPLIT].seed(link.seed)
+        clips = [CaterScene(SPLIT, seed, variant).clip() for variant in range(CAPTIONS)]
+        self.link, self.clip, self.jitter = link, clips[0], clip_of(seed)[1]
+        self.clips = {clip.instruction: clip for clip in clips}
+        self.task = self.clip.instruction
+        self.table.build(self.clip, self.jitter)
+        self.rgb, self.labels = self.table.render(0)
+        # Two things may be alike.
+        seen: Counter[str] = Counter()
+        self.called = []
+        for thing in self.clip.things:
+            seen[thing.name] += 1
+            self.called.append(thing.name if seen[thing.name] == 1 else f"{thing.name} {seen[thing.name]}")
+
+    def things(self) -> list[dict[str, Any]]:
+        """What is there, and where in the picture."""
+        camera = PinholeCamera(self.table.camera.intrinsics, self.table.camera.extrinsics)
+        of_all = zip(self.called, self.clip.things, self.clip.poses(0)[0], strict=True)
+        return [
+            {
+                "name": name,
+                "color": list(thing.rgb),
+                "at": camera.project(center).tolist(),
+                "height": float(center[2]),
+            }
+            for name, thing, center in of_all
+        ]
+
+    def sentences(self, picture: Rollout | None) -> list[str]:
+        """The scene's own caption and others; none of a person's own picture, of which nothing is known."""
+        return list(self.clips) if picture is None else []
+
+    def names(self, rollout: Rollout, own_picture: bool) -> dict[int, str]:
+        """Whose true mask a slot's covers; of a person's own picture there is no truth, and slots have numbers."""
+        numbered = slot_names(rollout)
+        if own_picture:
+            return numbered
+        labels_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
+        found = object_ious(labels_HW, self.labels, range(1, 1 + len(self.called)), min_pixels=1)
+        matched = zip(found.ids, found.slots, found.ious, strict=True)
+        named = {int(slot): self.called[int(label) - 1] for label, slot, iou in matched if iou > OVERLAP}
+        return {slot: name for slot, name in numbered.items() if name == "table"} | named
+
+    def read(self, text: str) -> Clip:
+        """What happens when a caption is carried out; the same at every time."""
+        known = {" ".join(one.split()).lower(): clip for one, clip in self.clips.items()}
+        rng = np.random.default_rng([self.link.seed, zlib.crc32(text.encode())])
+        return known.get(" ".join(text.split()).lower()) or read_caption(text, self.clip.things, rng)
+
+    def act(self, wish: Clip, rollout: Rollout) -> np.ndarray:
+        """The frames of the clip; then the scene stands as before."""
+        self.table.build(wish, self.jitter)
+        return np.stack([self.table.render(frame)[0] for frame in range(FRAMES)])
