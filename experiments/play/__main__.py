@@ -86,7 +86,10 @@ def serve(command: PlayCommand) -> None:
     url = f"http://{shown if alone else socket.gethostname()}:{port}/"
     print(f"textocvp play: {url} (Ctrl-C ends it)", flush=True)
     if alone:  # a page of another host that calls itself by a name for this one is not answered
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, "localhost"])
+        # Of an IPv6 address older versions of Starlette see no more than "[", which no other host is called.
+        app.add_middleware(
+            TrustedHostMiddleware, allowed_hosts=[shown, "localhost", *(["["] if ":" in host else [])]
+        )
     else:
         said = f"--host {command.host}: everyone who reaches this machine over the network can open the page"
         print(f"textocvp: {said}, without a password", file=sys.stderr, flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -51,12 +50,9 @@ class Cater:
         self.task = self.clip.instruction
         self.table.build(self.clip, self.jitter)
         self.rgb, self.labels = self.table.render(0)
-        # Two things may be alike.
-        seen: Counter[str] = Counter()
-        self.called = []
-        for thing in self.clip.things:
-            seen[thing.name] += 1
-            self.called.append(thing.name if seen[thing.name] == 1 else f"{thing.name} {seen[thing.name]}")
+        names = [thing.name for thing in self.clip.things]  # of which two may be alike
+        counts = [names[: k + 1].count(name) for k, name in enumerate(names)]
+        self.called = [f"{name} {n}" if n > 1 else name for name, n in zip(names, counts, strict=True)]
 
     def things(self) -> list[dict[str, Any]]:
         """What is there, and where in the picture."""

@@ -243,6 +243,6 @@ def create_app(
             session.save(path := Path(folder, f"film.{kind}"))
             data = path.read_bytes()
         headers = {"Content-Disposition": f'attachment; filename="imagined.{kind}"'}
-        return Response(data, media_type=MEDIA[kind], headers=headers)
+        return Response(data, media_type=MEDIA[path.suffix[1:]], headers=headers)
 
     return app

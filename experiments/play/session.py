@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 
 from experiments.play.links import Link, Refused
 from experiments.play.plans import plan_data
@@ -24,6 +25,7 @@ from textocvp.film_page import film_data, picture_url, save_page
 from textocvp.pictures import SUFFIXES, read_picture, save_film
 
 MOST_SENTENCES = 12  # side by side
+MOST_PIXELS = 50_000_000  # of a picture, which are unpacked to four bytes each
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,17 @@ class Session:
         if self.before_goal is not None:
             self._check_scene()
         try:
-            picture, done = read_picture(BytesIO(data), self.world_model.image_size, resize=True)
-        except (OSError, ValueError) as error:  # what no picture can be read from is an OSError, too
-            raise Refused(f"this is no picture that can be read: {error}") from None
-        except Exception as error:  # a picture of too many pixels, or one damaged in a way of its own
-            raise Refused(f"this picture cannot be taken: {error}") from None
+            with Image.open(BytesIO(data)) as opened:
+                large = opened.width * opened.height > MOST_PIXELS
+            if not large:
+                picture, done = read_picture(BytesIO(data), self.world_model.image_size, resize=True)
+        except Image.DecompressionBombError:
+            large = True
+        except Exception as error:  # pictures are damaged in many ways
+            what = "it is of no known kind" if isinstance(error, UnidentifiedImageError) else str(error)
+            raise Refused(f"this is no picture that can be read: {what}") from None
+        if large:
+            raise Refused(f"the picture has too many pixels: more than {MOST_PIXELS // 10**6} million")
         self.picture = picture
         return done
 

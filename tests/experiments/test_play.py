@@ -214,6 +214,12 @@ def test_a_wrong_link_is_said_and_another_scene_is_shown(open_page) -> None:
     assert "not 'abc'" in opened["problems"][0] and opened["scene"]["link"] == "seed=0"
 
 
+def blank(width: int, height: int) -> bytes:
+    """A picture file that is small however large the picture is."""
+    Image.new("1", (width, height)).save(buffer := io.BytesIO(), "PNG")
+    return buffer.getvalue()
+
+
 def upload(page: Page, data: bytes) -> Any:
     return page.client.post(f"/api/{page.name}/picture", content=data)
 
@@ -255,7 +261,9 @@ def test_a_wrong_picture_is_refused_in_a_sentence(open_page) -> None:
     )
     for data, said in (
         (b"", "no picture"),
-        (b"Dear sir or madam", "no picture"),
+        (b"Dear sir or madam", "it is of no known kind"),
+        (blank(8000, 8000), "too many pixels: more than 50 million"),
+        (blank(20000, 10000), "too many pixels: more than 50 million"),
         (buffer.getvalue()[:3000], "no picture"),
         (bytes(50 * 2**20), "50 MB; at most 20 MB"),
     ):
@@ -279,6 +287,7 @@ def test_films_can_be_downloaded(open_page, tmp_path: Path) -> None:
     film = iio.imread(page.client.get(f"/api/{page.name}/film.gif").content, extension=".gif")
     assert len(film) == 2 * (HORIZON + 1) and film.shape[2] > 3 * 256
     assert page.client.get(f"/api/{page.name}/film.html").text.count('"real"') == 2
+    assert page.client.get(f"/api/{page.name}/film.gif.html").headers["content-type"].startswith("text/html")
     assert "not '.exe'" in page.client.get(f"/api/{page.name}/film.exe").json()["error"]
 
 
@@ -541,6 +550,27 @@ def test_where_it_cannot_listen_it_says_why(capsys) -> None:
 def test_the_address_says_who_can_reach_it() -> None:
     assert command.is_loopback("127.0.0.1") and command.is_loopback("::1")
     assert not command.is_loopback("0.0.0.0") and not command.is_loopback("::")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_page_of_this_machine_alone_answers_to_its_own_names_only(host, monkeypatch) -> None:
+    served: list[Any] = []
+    monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: served.append(self.config.app))
+    if host == "::1" and not Path("/proc/net/if_inet6").exists():
+        pytest.skip("this machine has no IPv6")
+    assert command.main(["--no-browser", "--port", "0", "--host", host]) == 0
+    own = f"[{host}]" if ":" in host else host
+    client = TestClient(served[0])
+    for name, status in ((own, 200), (f"{own}:7860", 200), ("localhost:7860", 200), ("another.example", 400)):
+        assert client.get("/", headers={"host": name}).status_code == status, name
+
+
+def test_who_opens_the_page_to_the_network_is_told(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: None)
+    assert command.main(["--no-browser", "--port", "0", "--host", "0.0.0.0"]) == 0
+    assert "everyone who reaches this machine" in capsys.readouterr().err
+    assert command.main(["--no-browser", "--port", "0"]) == 0
+    assert "everyone" not in capsys.readouterr().err
 
 
 def test_the_command_line_finds_the_page(capsys, monkeypatch) -> None:
