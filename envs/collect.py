@@ -102,9 +102,7 @@ class Args:
             if getattr(self, name) != defaults[name]:
                 raise ValueError(f"--{name.replace('_', '-')} is not for --world {self.world}")
         if self.world == "cater" and self.split not in CATER_SPLITS:
-            raise ValueError(
-                f"--split of --world cater is one of {', '.join(CATER_SPLITS)}, not {self.split}"
-            )
+            raise ValueError(f"--split of --world cater is one of {', '.join(CATER_SPLITS)}, not {self.split}")
 
 
 def main(args: Args) -> None:

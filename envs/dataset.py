@@ -278,11 +278,7 @@ def scene_of(path: str | os.PathLike[str], index: int) -> tuple[TabletopEnv, Obs
             seed = int(rows["seed"][index % count])
             sentence = int(rows["sentence"][index % count]) if "sentence" in rows else 0
             # Files of the first days have no options, but the same code drew them.
-            stored = (
-                json.loads(rows["options"].asstr()[index % count])
-                if "options" in rows
-                else config.options(seed)
-            )
+            stored = json.loads(rows["options"].asstr()[index % count]) if "options" in rows else config.options(seed)
     except (OSError, KeyError, TypeError) as error:
         raise ValueError(f"{path} was not written by envs.collect, or is damaged: {error}") from error
     env = config.make()
@@ -319,9 +315,7 @@ def _ends(infos: list[dict[str, Any]]) -> NDArray[np.int64]:
     return np.cumsum([len(each["frames"]) for each in infos]) - 1
 
 
-def _primitives(
-    infos: list[dict[str, Any]], actions: list[NDArray[np.float32]]
-) -> tuple[dict[str, Any], ...]:
+def _primitives(infos: list[dict[str, Any]], actions: list[NDArray[np.float32]]) -> tuple[dict[str, Any], ...]:
     """The primitives of an episode, each with the number of the frame before it moves."""
     pairs = zip(_ends(infos)[:-1].tolist(), actions, strict=True)
     return tuple({"frame": frame, "action": action.tolist()} for frame, action in pairs)
@@ -440,9 +434,7 @@ def _create(file: h5py.File, config: World) -> None:
         file.create_dataset(name, dtype=dtype, **sizes, **compression)
     for name, (dtype, _) in {"start": ("i8", None), **config.columns}.items():
         base, shape = (dtype.base, dtype.shape) if isinstance(dtype, np.dtype) else (dtype, ())
-        file.create_dataset(
-            f"episode/{name}", (0, *shape), base, maxshape=(None, *shape), chunks=(1024, *shape)
-        )
+        file.create_dataset(f"episode/{name}", (0, *shape), base, maxshape=(None, *shape), chunks=(1024, *shape))
     file.attrs.update(
         format=FORMAT,
         format_version=FORMAT_VERSION,
@@ -537,9 +529,7 @@ def _joblib_backend(backend: Backend, workers: int) -> Iterator[None]:
             register_ray()
             cluster = ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else workers)
     except ModuleNotFoundError as error:
-        raise ValueError(
-            f"the backend {backend} is not installed: pip install 'textocvp[{backend}]'"
-        ) from error
+        raise ValueError(f"the backend {backend} is not installed: pip install 'textocvp[{backend}]'") from error
     with cluster, nullcontext() if backend == "processes" else parallel_config(backend):
         yield
 
@@ -615,9 +605,7 @@ def _collect_piece(config: World, start: int, stop: int, piece: Path, collector:
         return
     env = _environment(config, threading.get_ident())
     episodes = list(config.record(env, range(start, stop)))
-    values = {
-        name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in config.arrays
-    }
+    values = {name: np.concatenate([_padded(name, e.arrays[name]) for e in episodes]) for name in config.arrays}
     for name, (dtype, value) in config.columns.items():
         values[f"episode/{name}"] = np.array([value(episode) for episode in episodes], dtype)
     with replacing(piece, piece.parent) as part, hdf5_to_write(part) as file:

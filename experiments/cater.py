@@ -135,9 +135,7 @@ class CaterUnit:
 
         captions = dict.fromkeys([clip, *others])
         for name, model in models.items():
-            shown = {
-                one: imagine(worker, model, first, one.instruction, T - 1, self.seed) for one in captions
-            }
+            shown = {one: imagine(worker, model, first, one.instruction, T - 1, self.seed) for one in captions}
             compare(name, shown[clip])
             control(name, shown)
             if name == "ours" and others:
@@ -178,9 +176,7 @@ def follows(model: Any, clip: Actions, truth: Episode, seed: int) -> float | Non
     if acts is None or act.thing not in slots or act.into not in slots:
         return None
     after = Actions((cone, *rest), acts)
-    went = model.rollout(first.last, [after.instruction], horizon=len(truth.frames) - 1, seed=seed).positions[
-        0
-    ]
+    went = model.rollout(first.last, [after.instruction], horizon=len(truth.frames) - 1, seed=seed).positions[0]
     cone_T2, inside_T2 = went[:, slots[act.thing]], went[:, slots[act.into]]
     moved = float((cone_T2[-1] - cone_T2[0]).norm()) > FOLLOWED
     return float(moved and float((cone_T2[-1] - inside_T2[-1]).norm()) <= FOLLOWED)
@@ -207,9 +203,7 @@ class Film:
     def run(self, worker: Worker) -> Clip:
         """Imagine it once more."""
         truth = watched(self.scene)
-        seen = imagine(
-            worker, worker.world_model, truth.frames[0], truth.instruction, len(truth.frames) - 1, self.seed
-        )
+        seen = imagine(worker, worker.world_model, truth.frames[0], truth.instruction, len(truth.frames) - 1, self.seed)
         place = f"{'best' if self.best else 'worst'} {self.rank}"
         return Clip(
             name=f"cater-{place.replace(' ', '-')}.gif",

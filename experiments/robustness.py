@@ -73,11 +73,7 @@ DEFAULT = Sizes(imagined=50, loop=50, controls=25, changed=40, clips=10, acted=6
 def sizes_of(args: ScenesArgs) -> Sizes:
     """How much a command line asks for."""
     sizes, most = QUICK if args.quick else DEFAULT, args.scenes
-    return (
-        replace(sizes, imagined=most, loop=most, controls=min(most, sizes.controls), changed=most)
-        if most
-        else sizes
-    )
+    return replace(sizes, imagined=most, loop=most, controls=min(most, sizes.controls), changed=most) if most else sizes
 
 
 # --- units of work ----------------------------------------------------------------------------------------------------
@@ -396,9 +392,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             [
                 bars_table(results, run.measures),
                 plot_table("drops.png", drops, figures, label=f"{name} drop at {SHORT}, %", limits=None),
-                plot_table(
-                    "closed_loop.png", LOOP_TABLE, figures, label="closed-loop success", caption=judged
-                ),
+                plot_table("closed_loop.png", LOOP_TABLE, figures, label="closed-loop success", caption=judged),
             ],
         ),
         *(

@@ -235,8 +235,7 @@ def parse(args: Args, checkpoint: Path, folder: Path) -> None:
     """Write the slots of all clips, with several processes: a parser that looks at pixels one by one is slow."""
     for name, file in SLOTS.items():
         jobs = (
-            delayed(_parse)(checkpoint, args.out / file, folder / name, i, args.workers)
-            for i in range(args.workers)
+            delayed(_parse)(checkpoint, args.out / file, folder / name, i, args.workers) for i in range(args.workers)
         )
         Parallel(n_jobs=args.workers)(jobs)
     (folder / DONE).touch()

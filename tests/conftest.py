@@ -26,9 +26,7 @@ SECONDS = 5.0  # for what is just ending
 if find_spec("pybullet") is None:  # as on the newest Pythons
     tests = Path(__file__).parent
     collect_ignore = ["envs", "experiments", "test_readme.py"]
-    collect_ignore += [
-        str(file) for file in tests.rglob("test_*.py") if NEEDS_PYBULLET.search(file.read_text("utf-8"))
-    ]
+    collect_ignore += [str(file) for file in tests.rglob("test_*.py") if NEEDS_PYBULLET.search(file.read_text("utf-8"))]
 
 
 @pytest.fixture(autouse=True)

@@ -51,14 +51,10 @@ def test_every_training_command_is_one_that_is_understood(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # where there are no episodes: the first thing to be missed
     for arguments in trainings(page):
-        assert cli.main(["train", *arguments]) == 1, (
-            arguments
-        )  # 2, as an exit, for options that there are not
+        assert cli.main(["train", *arguments]) == 1, arguments  # 2, as an exit, for options that there are not
         assert "there is no episode file" in capsys.readouterr().err, arguments
 
 
 def test_commands_are_found() -> None:
-    assert (
-        len(trainings(ROOT / "docs" / "models.md")) >= 12 and len(trainings(ROOT / "docs" / "scale.md")) == 3
-    )
+    assert len(trainings(ROOT / "docs" / "models.md")) >= 12 and len(trainings(ROOT / "docs" / "scale.md")) == 3
     assert all(trainings(card) for card in CARDS)

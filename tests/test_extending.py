@@ -59,13 +59,9 @@ def tables_as_they_are() -> Iterator[None]:
 
 def example(name: str) -> dict[str, Any]:
     """Run the page's blocks of that name, in order; returns what they define."""
-    blocks = re.findall(
-        rf"^```python {name}\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
+    blocks = re.findall(rf"^```python {name}\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     assert blocks, f"{PAGE.name} has no example of {name}"
-    module = sys.modules[f"example_{name}"] = ModuleType(
-        f"example_{name}"
-    )  # where dataclasses look up their types
+    module = sys.modules[f"example_{name}"] = ModuleType(f"example_{name}")  # where dataclasses look up their types
     for block in blocks:
         exec(compile(block, f"{PAGE.name}: {name}", "exec", dont_inherit=True), module.__dict__)
     return vars(module)
@@ -73,9 +69,7 @@ def example(name: str) -> dict[str, Any]:
 
 def test_every_block_is_run() -> None:
     marks = set(re.findall(r"^```(\w+.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
-    assert marks == {
-        f"python {n}" for n in ("task", "data", "parser", "text", "predictor", "planner", "baseline")
-    }
+    assert marks == {f"python {n}" for n in ("task", "data", "parser", "text", "predictor", "planner", "baseline")}
 
 
 def test_a_task_is_played_recorded_and_understood() -> None:
@@ -146,9 +140,7 @@ def test_a_part_is_chosen_by_its_kind_and_trained(name, preset, settings, part, 
     before = TextOCVP(with_settings(PRESETS[preset], (*SMALL, *settings)))
     model = train_both(tmp_path, data, *settings, preset=preset).model
     kind = settings[0].partition("=")[2]
-    assert getattr(model.config, part).kind == kind and type(getattr(model, part)) is type(
-        getattr(before, part)
-    )
+    assert getattr(model.config, part).kind == kind and type(getattr(model, part)) is type(getattr(before, part))
     assert model.predictor.uses_text == (name != "predictor")
 
 

@@ -96,9 +96,7 @@ def test_model_and_planner_do_without_pybullet_beside_other_folders(own_project:
     assert done.stdout.strip().endswith(f";{Goal.parse(sentence)}")
 
 
-@pytest.mark.parametrize(
-    "code", [MAKE.format({}), "import textocvp.envs", "from textocvp.envs import collect"]
-)
+@pytest.mark.parametrize("code", [MAKE.format({}), "import textocvp.envs", "from textocvp.envs import collect"])
 def test_environments_say_where_pybullet_can_be_had(code: str, tmp_path: Path) -> None:
     done = run(WITHOUT_PYBULLET + code, tmp_path)
     assert done.returncode == 1 and "conda install -c conda-forge pybullet" in done.stderr.splitlines()[-1]

@@ -14,9 +14,7 @@ import pytest
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "policies.md"
 NEEDED = {"sb3": "stable_baselines3", "moviepy": "moviepy"}
-BLOCKS = re.findall(
-    r"^```python ?(\w*)\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-)
+BLOCKS = re.findall(r"^```python ?(\w*)\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
 def run(names: dict[str, Any], mark: str) -> dict[str, Any]:

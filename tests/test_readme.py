@@ -39,10 +39,7 @@ class Snippet:
 
 def snippets() -> Iterator[Snippet]:
     for comments, language, text in BLOCK.findall(README):
-        notes = {
-            name: value.strip()
-            for name, value in re.findall(r"<!-- (\w+):\s*(.*?)\s*-->", comments, re.DOTALL)
-        }
+        notes = {name: value.strip() for name, value in re.findall(r"<!-- (\w+):\s*(.*?)\s*-->", comments, re.DOTALL)}
         yield Snippet(language, text, notes.get("instead", text), notes.get("ci"), notes.get("because"))
 
 
@@ -56,9 +53,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     programs = folder / "programs"
     programs.mkdir()
     (programs / "python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
-    if (
-        shutil.which("textocvp", path=str(Path(sys.executable).parent)) is None
-    ):  # not installed: run from the source
+    if shutil.which("textocvp", path=str(Path(sys.executable).parent)) is None:  # not installed: run from the source
         (programs / "textocvp").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m textocvp.cli "$@"\n')
     for program in programs.iterdir():
         program.chmod(0o755)
@@ -66,9 +61,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(commands: str, folder: Path) -> None:
-    path = os.pathsep.join(
-        [str(folder / "programs"), str(Path(sys.executable).parent), os.environ.get("PATH", "")]
-    )
+    path = os.pathsep.join([str(folder / "programs"), str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     environment = {**os.environ, "PATH": path, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "2"}
     for command in commands.replace("\\\n", " ").strip().splitlines():
         done = subprocess.run(

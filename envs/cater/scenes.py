@@ -302,9 +302,7 @@ def hidden(things: Sequence[Thing]) -> list[float]:
         for other, center in enumerate(centers):
             if other != k:
                 along = np.clip((rays @ (center - eye)) / np.square(rays).sum(1), 0, 1)
-                covered |= (
-                    np.linalg.norm(along[:, None] * rays - (center - eye), axis=1) < things[other].radius
-                )
+                covered |= np.linalg.norm(along[:, None] * rays - (center - eye), axis=1) < things[other].radius
         shares.append(float(covered.mean()))
     return shares
 

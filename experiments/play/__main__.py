@@ -87,9 +87,7 @@ def serve(command: PlayCommand) -> None:
     print(f"textocvp play: {url} (Ctrl-C ends it)", flush=True)
     if alone:  # a page of another host that calls itself by a name for this one is not answered
         # Of an IPv6 address older versions of Starlette see no more than "[", which no other host is called.
-        app.add_middleware(
-            TrustedHostMiddleware, allowed_hosts=[shown, "localhost", *(["["] if ":" in host else [])]
-        )
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[shown, "localhost", *(["["] if ":" in host else [])])
     else:
         said = f"--host {command.host}: everyone who reaches this machine over the network can open the page"
         print(f"textocvp: {said}, without a password", file=sys.stderr, flush=True)

@@ -17,9 +17,7 @@ BRANCHES = 12  # sequences of sentences that the tree shows
 Said = tuple[Instruction, ...]  # one after another
 
 
-def plan_data(
-    world_model: WorldModel, rgb: np.ndarray, goal: Goal | PictureGoal, plan: Plan
-) -> dict[str, Any]:
+def plan_data(world_model: WorldModel, rgb: np.ndarray, goal: Goal | PictureGoal, plan: Plan) -> dict[str, Any]:
     """A plan that was made from a picture (H, W, 3), without its films; all of it can be written as JSON."""
     shown = [one.instructions for one in plan.ranking[:BRANCHES]]
     known = {one.instructions: one for one in plan.ranking}
@@ -43,9 +41,7 @@ def plan_data(
         "reaches": plan.best.reaches_goal,
         "seconds": round(plan.seconds, 1),
         "tree": tree,
-        "obvious": None
-        if isinstance(goal, PictureGoal)
-        else _obvious(world_model, rgb, goal, plan.grounding),
+        "obvious": None if isinstance(goal, PictureGoal) else _obvious(world_model, rgb, goal, plan.grounding),
     }
 
 

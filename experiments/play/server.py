@@ -58,9 +58,7 @@ class Sessions:
         name = secrets.token_urlsafe(12)
         with self.lock:
             if len(self.heard_of) >= self.most:
-                raise Refused(
-                    f"{self.most} pages are open, and no more may be (--most-pages {self.most}); close one"
-                )
+                raise Refused(f"{self.most} pages are open, and no more may be (--most-pages {self.most}); close one")
             self.heard_of[name] = inf  # which keeps its place
         try:
             session = self.make(link)
@@ -75,9 +73,7 @@ class Sessions:
         """An open page; Closed for one that is not."""
         with self.lock:
             if (session := self.open.get(name)) is None:
-                raise Closed(
-                    "this page was closed, because nothing was heard of it for a while; load it again"
-                )
+                raise Closed("this page was closed, because nothing was heard of it for a while; load it again")
             self.heard_of[name] = time.monotonic()
             return session
 
@@ -99,9 +95,7 @@ class Sessions:
             self.close(name)
 
 
-def create_app(
-    world_model: WorldModel, choice: Choice, most_pages: int = 8, horizon: int | None = None
-) -> FastAPI:
+def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, horizon: int | None = None) -> FastAPI:
     """The application; its open pages are `app.state.sessions`.
 
     Args:
@@ -231,9 +225,7 @@ def create_app(
             data += part
             if len(data) > LARGEST_PICTURE:
                 size = int(request.headers.get("content-length", len(data))) / 2**20
-                raise Refused(
-                    f"the picture has {size:.0f} MB; at most {LARGEST_PICTURE // 2**20} MB are taken"
-                )
+                raise Refused(f"the picture has {size:.0f} MB; at most {LARGEST_PICTURE // 2**20} MB are taken")
         return await run_in_threadpool(ask, name, lambda one: {"done": one.upload(bytes(data))})
 
     @app.get("/api/{name}/film.{kind}")

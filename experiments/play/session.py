@@ -65,9 +65,7 @@ class Session:
         Refused, ValueError, GroundingError: from every method that takes wishes, with a sentence for the page.
     """
 
-    def __init__(
-        self, world_model: WorldModel, choice: Choice, link: Link, horizon: int | None = None
-    ) -> None:
+    def __init__(self, world_model: WorldModel, choice: Choice, link: Link, horizon: int | None = None) -> None:
         self.world_model = world_model
         self.lock = threading.Lock()
         self.world = choice.make(world_model.image_size[0])
@@ -127,9 +125,7 @@ class Session:
     def table(self) -> Tabletop:
         """The world, where things can be arranged in it and the scene is what is seen."""
         if not isinstance(self.world, Tabletop):
-            raise Refused(
-                "in this world things stay as they are drawn, and no plans are made; take another scene"
-            )
+            raise Refused("in this world things stay as they are drawn, and no plans are made; take another scene")
         if self.picture is not None:
             raise Refused("this is your own picture, in which nothing can be moved; go back to the scene")
         return self.world
@@ -275,8 +271,6 @@ class Session:
 
     def _check_scene(self) -> None:
         if self.picture is not None:
-            raise Refused(
-                "this is your own picture, with no simulator behind it; go back to the scene for that"
-            )
+            raise Refused("this is your own picture, with no simulator behind it; go back to the scene for that")
         if self.before_goal is not None:
             raise Refused("a goal is being arranged: say that this is the goal, or cancel")

@@ -139,6 +139,8 @@ METHODS: dict[str, Method] = {
                note="our parser reads the imagined frames, as it must for models without slots"),
         Method(key="ours, other words", hue=0,
                note="the same wish in another wording for each scene, of kinds that users write"),
+        Method(key="ours, free words", hue=0,
+               note="the same in 40 wordings by somebody who had not seen the model's rules"),
         Method(key="ours, privileged", kind="ceiling", hue=3, plan=_best, privileged=True,
                note="the same, but slots are named by the simulator's segmentation"),
         Method(key="savi", hue=7, note="published slot attention from pixels, and text", model="savi-cater-trained",

@@ -16,7 +16,7 @@ from experiments.report.tables import TableSpec, columns
 from experiments.study.methods import HORIZON, lines
 from experiments.study.pool import Worker
 from experiments.study.scenes import StudyScene, sample_scene
-from experiments.study.wordings import paraphrase
+from experiments.study.wordings import free_wording, paraphrase
 from planning import Instruction, Thing
 from textocvp.inputs import ForeignPictureWarning
 from textocvp.metrics import overlaps
@@ -67,6 +67,7 @@ CHANGES: Mapping[str, Callable[[Picture, Mask, np.random.Generator], NDArray[Any
 WORDS: Mapping[str, Callable[[int, str, str], str]] = {
     "ours": lambda number, block, bowl: f"put the {block} block in the {bowl} bowl",
     "ours, other words": paraphrase,
+    "ours, free words": free_wording,
 }
 """Line of a table -> the wording, of the scene's number and two colours."""
 

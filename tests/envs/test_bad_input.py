@@ -72,9 +72,7 @@ def layout(*items: dict[str, Any], **change: Any) -> dict[str, Any]:
         ({"arm_start": [0.0] * 5}, "arm_start must be"),
     ],
 )
-def test_wrong_reset_options_are_refused_before_anything_changes(
-    make: Make, options: Any, message: str
-) -> None:
+def test_wrong_reset_options_are_refused_before_anything_changes(make: Make, options: Any, message: str) -> None:
     env = make(record_frames=True)
     env.reset(seed=4)
     before = env.unwrapped._info()
@@ -103,9 +101,7 @@ def test_wrong_primitives_are_refused_before_anything_moves(make: Make, action: 
     env = make(record_frames=True).unwrapped
     env.reset(seed=4)
     steps = env.world.steps
-    with pytest.raises(
-        ValueError, match=r"\[pick_x, pick_y, place_x, place_y\], finite .* from \[0.25, -0.25"
-    ):
+    with pytest.raises(ValueError, match=r"\[pick_x, pick_y, place_x, place_y\], finite .* from \[0.25, -0.25"):
         env.step(action)
     assert env.world.steps == steps
 

@@ -139,9 +139,7 @@ def test_actions_can_be_asked_for():
         acts = draw_acts(np.random.default_rng(seed), things, first=(0, "contain"))
         assert acts is not None
         assert (acts[0].action, acts[0].into) == ("contain", 1)
-    assert (
-        draw_acts(np.random.default_rng(0), things, first=(2, "contain")) is None
-    )  # a cube contains nothing
+    assert draw_acts(np.random.default_rng(0), things, first=(2, "contain")) is None  # a cube contains nothing
 
 
 def test_pictures_show_the_clip(table):
@@ -160,9 +158,7 @@ def test_pictures_show_the_clip(table):
     assert (labels == 2).sum() > 4 and (late == 2).sum() == 0  # what is contained is hidden
     red = first[labels == 1].mean(0)
     assert red[0] > 2 * red[1] and red[0] > 2 * red[2]
-    alone = np.array(
-        [[not labels[y - 2 : y + 3, x - 2 : x + 3].any() for x in range(2, 62)] for y in range(2, 62)]
-    )
+    alone = np.array([[not labels[y - 2 : y + 3, x - 2 : x + 3].any() for x in range(2, 62)] for y in range(2, 62)])
     floor = first[2:62, 2:62][alone].astype(int)
     assert np.ptp(floor, axis=-1).max() <= 3  # gray, and with shadows: some of it is darker than elsewhere
     assert floor.min() < 0.9 * np.median(floor)
@@ -193,9 +189,7 @@ def test_a_file_is_the_same_for_any_number_of_workers(tmp_path):
                 *(f"episode/{n}" for n in one["episode"]),
             )
         ]
-        assert all(
-            np.array_equal(one[name][:], two[name][:], equal_nan=name == "object_position") for name in names
-        )
+        assert all(np.array_equal(one[name][:], two[name][:], equal_nan=name == "object_position") for name in names)
         assert json.loads(one.attrs["labels"]) == {"background": 0}
         objects = json.loads(one["episode/objects"].asstr()[0])
         assert {"id", "label", "kind", "color", "size", "material"} == set(objects[0])
@@ -210,11 +204,7 @@ def test_the_command_line_names_what_does_not_go_together(tmp_path):
         Args(captions="ambiguous")
     with pytest.raises(ValueError, match="train, val, test, not unseen_colors"):
         Args(world="cater", split="unseen_colors")
-    main(
-        Args(
-            world="cater", split="val", episodes=2, image_size=32, out=tmp_path / "a.h5", captions="ambiguous"
-        )
-    )
+    main(Args(world="cater", split="val", episodes=2, image_size=32, out=tmp_path / "a.h5", captions="ambiguous"))
     with h5py.File(tmp_path / "a.h5") as file:
         assert all(
             "quadrant" in one or "rotating" in one or "containing" in one
@@ -236,16 +226,10 @@ def test_captions_are_read_as_they_are_written(clips) -> None:
         assert again == said
         loose = clip.ambiguous(np.random.default_rng(1))
         read = rewritten(clip, loose)
-        for sentence, act in zip(
-            loose.split(". "), sorted(clip.acts, key=lambda act: act.thing), strict=True
-        ):
+        for sentence, act in zip(loose.split(". "), sorted(clip.acts, key=lambda act: act.thing), strict=True):
             # What it says is true of one of the acts: the action, the words of the name, and the quadrant.
             name = sentence.removeprefix("the ").split(" is ")[0].split()
-            kept = [
-                a
-                for a in read.acts
-                if a.action == act.action and {*name} <= {*clip.things[a.thing].name.split()}
-            ]
+            kept = [a for a in read.acts if a.action == act.action and {*name} <= {*clip.things[a.thing].name.split()}]
             assert kept
             if act.to is not None and act.into is None:
                 assert any((a.to[0] > 0, a.to[1] > 0) == (act.to[0] > 0, act.to[1] > 0) for a in kept if a.to)

@@ -136,15 +136,11 @@ def test_the_page_names_every_field(whole: Path) -> None:
         assert f"| `{name.removeprefix('@')}` |" in page, name
 
 
-def test_the_example_of_the_page_writes_what_is_needed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_the_page_writes_what_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     monkeypatch.chdir(tmp_path)
     exec(page.split("## A file of your own")[1].split("```python\n")[1].split("```")[0], {})
-    needed = {
-        line.split("`")[1] for line in page.splitlines() if line.startswith("| `") and "| yes |" in line
-    }
+    needed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `") and "| yes |" in line}
     assert {name.removeprefix("@") for name in contents(tmp_path / "own.h5")} == {*needed, "episode"}
     with h5py.File("own.h5") as file:
         assert len(file["frames"]) == file["episode/length"][:].sum() == 51
@@ -425,9 +421,7 @@ def test_two_collectors_of_one_file_do_not_meet(tmp_path: Path) -> None:
         collect(config, 1, out)
     assert not out.exists()
     collect(config, 1, out)
-    assert dataset.episode_count(out, config) == 1 and [path.name for path in tmp_path.iterdir()] == [
-        "one.h5"
-    ]
+    assert dataset.episode_count(out, config) == 1 and [path.name for path in tmp_path.iterdir()] == ["one.h5"]
 
 
 def test_fresh_throws_the_episodes_away_and_nothing_else(tmp_path: Path) -> None:

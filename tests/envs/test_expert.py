@@ -21,9 +21,7 @@ STARTS = (
 )
 
 
-def play(
-    env: gym.Env[Any, Any], instruction: str | None = None
-) -> tuple[float, bool, dict[str, Any], list[Any]]:
+def play(env: gym.Env[Any, Any], instruction: str | None = None) -> tuple[float, bool, dict[str, Any], list[Any]]:
     """Total reward, terminated, last info, and all frames of the expert's episode."""
     total, frames, terminated, info = 0.0, [], False, {}
     for action in Expert(env).actions(instruction):
@@ -41,9 +39,7 @@ def test_the_expert_succeeds(make: Make, control: str) -> None:
     for seed in range(20):
         env.reset(seed=seed, options=STARTS[seed % len(STARTS)])
         reward, terminated, info, _ = play(env)
-        assert (reward, terminated, info["is_success"], info["cliport_success"]) == (1.0, True, True, True), (
-            seed
-        )
+        assert (reward, terminated, info["is_success"], info["cliport_success"]) == (1.0, True, True, True), seed
 
 
 @pytest.mark.parametrize("options", STARTS)
@@ -125,9 +121,7 @@ def test_the_expert_refuses_what_is_not_there(make: Make) -> None:
     env = make()
     _, info = env.reset(seed=1)
     colors = [item["color"] for item in info["objects"]]
-    missing = next(
-        color for color in ("white", "orange", "pink", "purple", "red", "blue") if color not in colors
-    )
+    missing = next(color for color in ("white", "orange", "pink", "purple", "red", "blue") if color not in colors)
     with pytest.raises(ValueError, match=f"the scene has no {missing} block; it has: .*bowl"):
         Expert(env).actions(f"put the {missing} block in the {colors[0]} bowl")
     with pytest.raises(TypeError, match="not PendulumEnv"):

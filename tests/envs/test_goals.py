@@ -47,9 +47,7 @@ def anything(env: gym.Env[Any, Any], count: int) -> Iterator[np.ndarray]:
         action = env.action_space.sample()
         if number % 2 and env.unwrapped.control == "primitive":
             index = number % len(world.objects)
-            action[:2] = np.clip(
-                world.pose(index)[0][:2], env.action_space.low[:2], env.action_space.high[:2]
-            )
+            action[:2] = np.clip(world.pose(index)[0][:2], env.action_space.low[:2], env.action_space.high[:2])
         yield action
 
 
@@ -78,9 +76,7 @@ def test_the_goal_names_the_things_and_their_places(make: Make) -> None:
     positions = [item["position"] for item in info["objects"]]
     assert info["target"].shape == (3, 2) and info["target"][2].tolist() == [-1, -1]
     for action in Expert(env).actions():
-        desired, achieved = (
-            observation[name][:-3].reshape(8, 12) for name in ("desired_goal", "achieved_goal")
-        )
+        desired, achieved = (observation[name][:-3].reshape(8, 12) for name in ("desired_goal", "achieved_goal"))
         left = observation["goal"].reshape(8, 15)
         for thing, target in info["target"][:2]:
             done = info["supports"][thing] == target
@@ -240,9 +236,7 @@ def test_the_checkers_find_nothing(env_id: str, control: str, reward: str) -> No
     env.close()
 
 
-@pytest.mark.parametrize(
-    "observations", [("state", "goal"), ("state", *GOALS), "goal", ("rgb", "goal"), ("rgb",)]
-)
+@pytest.mark.parametrize("observations", [("state", "goal"), ("state", *GOALS), "goal", ("rgb", "goal"), ("rgb",)])
 def test_stable_baselines_checker_finds_nothing(observations: Any) -> None:
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     for env_id, (control, reward) in product(IDS, [("primitive", "dense"), ("ee", "sparse")]):

@@ -225,9 +225,7 @@ def test_use_after_close_is_a_clear_error_and_touches_no_other_world() -> None:
 
 
 @pytest.mark.parametrize("scene", ["simple", "cliport"])
-def test_a_swept_temporary_folder_is_filled_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: str
-) -> None:
+def test_a_swept_temporary_folder_is_filled_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: str) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "swept"))
     env = tiny(scene=scene)
     observation, _ = env.reset(seed=2)

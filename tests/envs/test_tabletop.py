@@ -59,9 +59,7 @@ def test_observations_and_rewards_have_their_types(make: Make, control: str) -> 
 
 
 def test_the_package_name_in_the_id_is_enough() -> None:
-    code = (
-        'import gymnasium as gym; print(gym.make("envs:PutBlockInBowl-v0").reset(seed=0)[0]["instruction"])'
-    )
+    code = 'import gymnasium as gym; print(gym.make("envs:PutBlockInBowl-v0").reset(seed=0)[0]["instruction"])'
     out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "put the" in out.stdout
 

@@ -28,9 +28,7 @@ def results(quick: bool = False) -> Results:
         seconds=12.5,
         rows=[row()],
         headline={"predicted_original": 0.9},
-        episodes=(
-            EpisodeLine("ours", "controllability, original", "predicted_success", "0a" * 6, 50, "go", 1.0),
-        ),
+        episodes=(EpisodeLine("ours", "controllability, original", "predicted_success", "0a" * 6, 50, "go", 1.0),),
     )
 
 
@@ -54,9 +52,7 @@ def report(quick: bool = False) -> Report:
         "put <b>it</b> there",
         badge="worst 1",
     )
-    plot = interval_plot(
-        "p.png", ["original", "variants"], [Series("ours", [(0.9, 0.8, 1.0), None])], label="success"
-    )
+    plot = interval_plot("p.png", ["original", "variants"], [Series("ours", [(0.9, 0.8, 1.0), None])], label="success")
     heat = heat_map("h.png", np.eye(3), ["block", "bowl", "arm"], ["put", "the", "block"], label="attention")
     return Report(
         title="Controllability",

@@ -42,9 +42,7 @@ class Foresight(oracle.StudyOracle):
         super().__init__(())
         self.kind, self.longest_horizon = kind, ahead  # type: ignore[assignment]
 
-    def rollout(
-        self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0
-    ) -> Rollout:
+    def rollout(self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         film = self._future(seed)
         rest = torch.arange(horizon + 1).clamp(max=film.slots.shape[1] - 1)
         true_TKD = film.slots[0, rest]

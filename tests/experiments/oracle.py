@@ -78,18 +78,14 @@ class StudyOracle:
         slots = []
         for t in range(len(video)):
             now = [{**item, "position": position_TN3[t, i]} for i, item in enumerate(_history[-1]["objects"])]
-            slots_KD = (
-                OracleWorldModel(lambda now=now: now, oracle.camera).parse(video[:1], seed=seed).slots[0, 0]
-            )
+            slots_KD = OracleWorldModel(lambda now=now: now, oracle.camera).parse(video[:1], seed=seed).slots[0, 0]
             (arm,) = (slots_KD[:, 3] == ARM).nonzero().flatten().tolist()
             color = slots_KD[arm, 4:7] * 0.5 + 0.5
             slots_KD[arm] = oracle._slot(ARM, tip_T3[t] + [0, 0, 0.01], color)
             slots.append(slots_KD)
         return oracle._rollout(torch.stack(slots)[None], ())
 
-    def rollout(
-        self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0
-    ) -> Rollout:
+    def rollout(self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         parsed = obs if isinstance(obs, Rollout) else self.parse(obs[None], seed=seed)
         text = [" ".join(reword(one, TABLETOP_REWRITES)) for one in text]
         return self._oracle().rollout(parsed, text, horizon=horizon, seed=seed)

@@ -130,15 +130,11 @@ def test_rows_count_scenes() -> None:
     rows = {(row.variant, row.metric): row for row in outcomes(made)}
     assert rows["original", "predicted_success"].value == 0.5
     assert rows["variants mean", "predicted_success"].value == 0.75
-    assert (
-        rows["original", "ends_within_6_px"].value == rows["variants mean", "ends_within_6_px"].value == 1.0
-    )
+    assert rows["original", "ends_within_6_px"].value == rows["variants mean", "ends_within_6_px"].value == 1.0
     assert rows["wrong text", "ends_within_6_px"].value == pytest.approx(1 / 6)
     assert rows["9 frames", "psnr"].value == 20.5
     assert {row.n for row in rows.values()} == {2}
-    assert (
-        rows["wrong text", "ends_within_6_px"].low > 0
-    )  # a rate has Wilson's interval, a mean a bootstrap's
+    assert rows["wrong text", "ends_within_6_px"].low > 0  # a rate has Wilson's interval, a mean a bootstrap's
     assert (rows["9 frames", "psnr"].low, rows["9 frames", "psnr"].high) == (20.0, 21.0)
 
 

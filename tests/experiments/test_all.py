@@ -28,9 +28,7 @@ class RunsArgs(StudyArgs):
 
 
 def tiny(name: str, title: str, question: str, **more: object) -> Study:
-    return replace(
-        study(Path("log")), name=name, title=title, question=question, args=StudyArgs, sizes=len_of, **more
-    )  # type: ignore[arg-type]
+    return replace(study(Path("log")), name=name, title=title, question=question, args=StudyArgs, sizes=len_of, **more)  # type: ignore[arg-type]
 
 
 def len_of(args: StudyArgs) -> int:
@@ -219,9 +217,7 @@ def test_a_phone_shows_the_index(args: Args, tmp_path: Path) -> None:
         "--window-size=500,900",
         "--dump-dom",
     ]
-    shown = subprocess.run(
-        [*command, page.as_uri()], capture_output=True, text=True, timeout=120, env=os.environ
-    )
+    shown = subprocess.run([*command, page.as_uri()], capture_output=True, text=True, timeout=120, env=os.environ)
     found = re.search(r'data-probe="(-?\d+)"', shown.stdout)
     assert found and int(found[1]) <= 0
     assert not re.search(r'(?:src|href)="(?:https?:)?//', page.read_text())

@@ -117,11 +117,7 @@ def test_the_study_measures_what_it_promises(tmp_path) -> None:
         "control_action",
         "control_place",
     } <= set(head)
-    truth = {
-        row.metric: row.value
-        for row in results.rows
-        if row.method == "true frames" and row.variant == "control"
-    }
+    truth = {row.metric: row.value for row in results.rows if row.method == "true frames" and row.variant == "control"}
     assert head["control_object_copy"] == 0.0 and truth["object"] >= 0.5
     assert (tmp_path / "report.html").stat().st_size > 10_000
     assert '"variant": 0' in (tmp_path / "scenes.json").read_text()

@@ -29,19 +29,14 @@ INTRINSICS = np.array([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
 EXTRINSICS = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
 START, BOWL, OTHER = (-0.2, 0.1, 0.03), (0.25, -0.2, 0.02), (-0.2, -0.25, 0.02)
 T = 12
-ASKED, OTHER_BOWL = (
-    Instruction.parse(f"put the red block in the {color} bowl") for color in ("blue", "gray")
-)
+ASKED, OTHER_BOWL = (Instruction.parse(f"put the red block in the {color} bowl") for color in ("blue", "gray"))
 
 
 def made_up(end: tuple[float, float, float]) -> Episode:
     """A block (object 1) goes straight to `end`; two bowls stand still. Segmentation by geometry."""
     camera = PinholeCamera(INTRINSICS, EXTRINSICS)
     position = np.array(
-        [
-            [BOWL, np.array(START) + (np.array(end) - START) * t / (T - 4) if t < T - 3 else end, OTHER]
-            for t in range(T)
-        ]
+        [[BOWL, np.array(START) + (np.array(end) - START) * t / (T - 4) if t < T - 3 else end, OTHER] for t in range(T)]
     )
     masks = np.zeros((T, 64, 64), np.uint8)
     rows, columns = np.mgrid[:64, :64] + 0.5
@@ -93,14 +88,9 @@ def test_what_is_named_twice_or_not_known_is_not_judged() -> None:
 def test_masks_that_are_the_truth_score_1_and_no_object_is_left_out() -> None:
     truth = made_up(BOWL)
     assert truth.segmentation is not None
-    assert all(
-        (curve == 1).all() and len(curve) == T - 1
-        for curve in mask_curves(truth.segmentation, truth).values()
-    )
+    assert all((curve == 1).all() and len(curve) == T - 1 for curve in mask_curves(truth.segmentation, truth).values())
     lost = np.where(truth.segmentation == 3, 0, truth.segmentation)
-    assert mask_curves(lost, truth)["iou"][0] == pytest.approx(
-        2 / 3, abs=0.01
-    )  # the background is matched to it
+    assert mask_curves(lost, truth)["iou"][0] == pytest.approx(2 / 3, abs=0.01)  # the background is matched to it
 
 
 def test_frames_are_reduced_by_area_only_where_a_model_needs_it() -> None:
@@ -134,9 +124,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return data
 
 
-def test_the_study_measures_what_can_be_measured(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_study_measures_what_can_be_measured(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     args = Args(checkpoint="tabletop-small", episodes=folder, out=tmp_path / "out", quick=True, workers=1)
     parser = "slot attention on EfficientNet-Lite0"
     loads = {"MAGE": LoadStill(None), parser: LoadCheckpoint("tabletop-small")}

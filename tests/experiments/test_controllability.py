@@ -131,8 +131,7 @@ def test_the_random_candidate_does_not_depend_on_the_order_of_episodes() -> None
 def test_sizes_are_bounded_by_the_controls() -> None:
     sizes = Sizes(predicted=1, slot_seeds=1, loop=8, other=6, long=4, controls=3, clips=1)
     counts = [
-        [sizes.scenes(split, method) for split, _ in LOOP_PLACES.values()]
-        for method in ("ours", "random candidate")
+        [sizes.scenes(split, method) for split, _ in LOOP_PLACES.values()] for method in ("ours", "random candidate")
     ]
     assert counts == [[8, 8, 8, 8, 6, 6, 4, 4], [3, 3, 3, 3, 3, 3, 2, 2]]
 

@@ -143,9 +143,7 @@ def test_rows_and_headline(tmp_path: Path) -> None:
     rows = figure_rows((one.scene.split, one.figures) for one in made)
     found = {(r.method, r.split, r.variant, r.metric): r for r in rows}
     assert found["ours", "controllability", "variants mean", "attends_bowl"].value == 1
-    assert (
-        found["ours", "controllability", "variants mean", "attends_bowl"].n == 1
-    )  # three texts of one scene
+    assert found["ours", "controllability", "variants mean", "attends_bowl"].n == 1  # three texts of one scene
     assert found["wrong sentence", "controllability", "original", "attends_bowl"].value == 0
     assert found["chance", "controllability", "original", "attends_block"].value == pytest.approx(1 / 8)
     assert ("wrong sentence", "controllability", "variants mean", "attends_bowl") not in found
@@ -215,9 +213,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_folder_is_complete(folder: Path) -> None:
     data = json.loads((folder / "results.json").read_text())
     assert data["study"] == "interpretability" and data["quick"] is True
-    assert (
-        data["headline"]["attends_block_test"] == 1 and "attends_bowl_colour_term_off" not in data["headline"]
-    )
+    assert data["headline"]["attends_block_test"] == 1 and "attends_bowl_colour_term_off" not in data["headline"]
     assert set(data["seeds"]) == {"slots", "scenes, test", "scenes, controllability", "scenes, unseen_colors"}
     assert any(row["method"] == "ours, layer 2 head 3" for row in data["rows"])
     names = {str(p.relative_to(folder)) for p in folder.rglob("*.*")}

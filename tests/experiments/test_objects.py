@@ -130,9 +130,7 @@ def test_a_wrong_text_names_something_else() -> None:
 
 
 def test_the_worst_and_the_best_are_those_with_the_least_and_most_overlap(tmp_path: Path) -> None:
-    this = Run(
-        STUDY, StudyArgs(out=tmp_path), load=LoadOracle(), sizes=Sizes(scenes=4, clips=2, apart=1), loads={}
-    )
+    this = Run(STUDY, StudyArgs(out=tmp_path), load=LoadOracle(), sizes=Sizes(scenes=4, clips=2, apart=1), loads={})
     values = (0.5, 0.1, 0.9, 0.2)
     outcomes = [{"ours": MaskScores(**{name: np.full(25, value) for name in FIELDS})} for value in values]
     chosen = cases(this, {"scenes": outcomes})
@@ -163,9 +161,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_figures_are_there_with_intervals(folder: Path) -> None:
     data = json.loads((folder / "results.json").read_text())
     head = data["headline"]
-    assert (
-        head["iou_9"] == head["iou_true_frames_9"] and head["iou_moving_19"] > head["iou_moving_copy_seed_19"]
-    )
+    assert head["iou_9"] == head["iou_true_frames_9"] and head["iou_moving_19"] > head["iou_moving_copy_seed_19"]
     assert head["iou_wrong_text_24"] == head["iou_copy_seed_24"] and 0 < head["ari_19"] <= 1
     assert not any("ocvp" in name for name in head)
     assert data["study"] == "objects" and data["quick"] is True and len(data["seeds"]["scenes, test"]) == 2
@@ -193,9 +189,7 @@ def test_an_unknown_baseline_is_an_early_error(tmp_path: Path) -> None:
 
 
 def test_the_shipped_model_goes_on_with_the_one_for_40_frames() -> None:
-    found, _ = find_models(
-        {key: LoadCheckpoint(METHODS[key].model) for key in STUDY.methods if METHODS[key].model}
-    )
+    found, _ = find_models({key: LoadCheckpoint(METHODS[key].model) for key in STUDY.methods if METHODS[key].model})
     far, other = found
     assert far.key == OURS_40 and far.longest == 40
     assert other.key == "OCVP-Seq" and other.checkpoint == "ocvp-seq-small"

@@ -129,9 +129,7 @@ def test_an_act_is_shown_beside_what_was_imagined_and_a_link_brings_all_of_it_ba
 def test_a_plan_goes_where_the_obvious_sentence_does_not(open_page) -> None:
     page = open_page(OCCUPIED)
     plan = page.ask("plan", text=ASKED)
-    assert plan["obvious"]["wrong"] == [
-        "the red block is imagined to end on the brown block, not in the cyan bowl"
-    ]
+    assert plan["obvious"]["wrong"] == ["the red block is imagined to end on the brown block, not in the cyan bowl"]
     assert plan["reaches"] and len(plan["sentences"]) == len(plan["films"]) == 2
     chosen = [node for node in plan["tree"] if node["chosen"]]
     assert [node["text"] for node in chosen] == plan["sentences"] and chosen[-1]["reaches"]
@@ -503,9 +501,7 @@ def test_a_picture_of_ones_own_in_cater_has_slots_with_numbers(open_cater) -> No
     answer = upload(page, buffer.getvalue()).json()
     assert not answer["warnings"] and answer["scene"]["own_picture"] and not answer["scene"]["sentences"]
     (film,) = page.ask("imagine", texts=[own])["films"]
-    assert len(film["slots"]) == 5 and all(
-        re.fullmatch(r"table|slot \d+", one["name"]) for one in film["slots"]
-    )
+    assert len(film["slots"]) == 5 and all(re.fullmatch(r"table|slot \d+", one["name"]) for one in film["slots"])
     assert "no simulator behind it" in page.refused("do", text=own)
 
 
@@ -591,9 +587,7 @@ def test_a_rollout_becomes_one_page_to_send(capsys, tmp_path: Path) -> None:
     iio.imwrite(tmp_path / "scene.png", env.reset(seed=0, options={"family": "occupied"})[0]["rgb"])
     arguments = ["rollout", str(tmp_path / "scene.png"), ASKED, "put the red block in the </script> bowl"]
     page = tmp_path / "sent" / "what-if.html"
-    assert (
-        cli.main([*arguments, "--horizon", "3", "--out", str(tmp_path / "a.gif"), "--html", str(page)]) == 0
-    )
+    assert cli.main([*arguments, "--horizon", "3", "--out", str(tmp_path / "a.gif"), "--html", str(page)]) == 0
     assert str(page) in capsys.readouterr().out
     text = page.read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=|https?://", text) and text.count("</script>") == 1

@@ -81,9 +81,7 @@ def visit(browser: Any, address: str) -> Iterator[Callable[..., Any]]:
         page = contexts[-1].new_page()
         page.set_default_timeout(WAIT)
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on(
-            "request", lambda one: one.url.startswith((address, "data:", "blob:")) or wrong.append(one.url)
-        )
+        page.on("request", lambda one: one.url.startswith((address, "data:", "blob:")) or wrong.append(one.url))
         page.goto(address + query)
         expect(page.locator("#message")).not_to_contain_text("Opening")
         return page
@@ -125,10 +123,7 @@ def test_type_imagine_do_and_plan(visit) -> None:
     press(page, "imagine")
     expect(page.locator(".film")).to_have_count(2)
     page.get_by_label("moment").fill("24")
-    assert (
-        drawn(page, "imagined").std() > 20
-        and len(np.unique(drawn(page, "slots").reshape(-1, 4), axis=0)) >= 7
-    )
+    assert drawn(page, "imagined").std() > 20 and len(np.unique(drawn(page, "slots").reshape(-1, 4), axis=0)) >= 7
     # Pointing at a picture names the thing.
     block = page.get_by_role("button", name="red block").last
     block.hover()
@@ -140,9 +135,7 @@ def test_type_imagine_do_and_plan(visit) -> None:
     expect(page.get_by_text("imagined to end on the brown block, not in the cyan bowl")).to_be_visible()
     expect(page.get_by_text("It is imagined to reach the goal.")).to_be_visible()
     press(page, "carry the plan out")
-    expect(page.locator("#message")).to_have_text(
-        "The goal is seen to be reached after 2. The simulator says so, too."
-    )
+    expect(page.locator("#message")).to_have_text("The goal is seen to be reached after 2. The simulator says so, too.")
     assert drawn(page, "what happened").shape == drawn(page, "difference").shape == (64, 64, 4)
     # The address brings the scene back as it is now.
     scene = page.locator("#scene").get_attribute("src")
@@ -233,9 +226,7 @@ def test_the_keyboard_is_enough(visit) -> None:
     page.keyboard.press("Enter")
     expect(page.locator(".film")).to_have_count(1)
     # Everything that can be pressed is reached by Tab.
-    wanted = set(
-        page.locator("button:visible:enabled").evaluate_all("all => all.map(one => one.textContent)")
-    )
+    wanted = set(page.locator("button:visible:enabled").evaluate_all("all => all.map(one => one.textContent)"))
     page.locator("h1").click()
     reached = set()
     for _ in range(80):
@@ -396,9 +387,7 @@ def test_cater_shows_scenes_and_captions_and_nothing_to_arrange(visit, cater) ->
 
 def test_films_of_cater_can_be_downloaded(visit, cater) -> None:
     page = visit("?seed=4", cater, viewport={"width": 390, "height": 800}, has_touch=True)
-    assert (
-        page.locator(".whole").inner_text() == page.get_by_label("sentence").input_value()
-    )  # too long for its field
+    assert page.locator(".whole").inner_text() == page.get_by_label("sentence").input_value()  # too long for its field
     press(page, "do it")
     expect(page.locator(".film")).to_have_count(1)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -88,9 +88,7 @@ def test_rows_of_a_figure() -> None:
 
 def outcome(split: str, number: int, ssim: float, good: bool) -> RobustOutcome:
     scene = study_scenes(split, number + 1, 0)[number]
-    return RobustOutcome(
-        scene, {"ours": {"ssim": np.full(24, ssim), "iou": np.full(24, 0.5)}}, {"ours": good}
-    )
+    return RobustOutcome(scene, {"ours": {"ssim": np.full(24, ssim), "iou": np.full(24, 0.5)}}, {"ours": good})
 
 
 def test_worst_cases_are_failures_first_and_never_of_the_test_set(tmp_path: Path) -> None:
@@ -133,9 +131,7 @@ def test_bars_are_passed_missed_or_undecided() -> None:
     assert as_percent(-0.064) == "-6.4 %" and as_percent(-0.0) == "0.0 %"
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "said"), [(0.7, 0.9, "within the interval"), (0.76, 0.9, ""), (0.5, 0.7, "")]
-)
+@pytest.mark.parametrize(("low", "high", "said"), [(0.7, 0.9, "within the interval"), (0.76, 0.9, ""), (0.5, 0.7, "")])
 def test_a_verdict_that_the_interval_leaves_open_says_so(low: float, high: float, said: str) -> None:
     value = (low + high) / 2
     row = Row("ours", "unseen_colors", "whole episode", "closed_loop_success", value, low, high, 8)
@@ -196,9 +192,7 @@ def test_the_study_as_a_whole(folder: Path) -> None:
     assert len(changed) == len(WORDS) * len(CHANGES) and {row.value for row in changed} == {1.0}
     test, unseen = (found.find("ours", "9 frames", "st_lpips", s) for s in ("test", "unseen_colors"))
     assert test is not None and unseen is not None
-    assert found.headline["lpips_drop_unseen_colors"] == pytest.approx(
-        unseen.value / test.value - 1, abs=1e-4
-    )
+    assert found.headline["lpips_drop_unseen_colors"] == pytest.approx(unseen.value / test.value - 1, abs=1e-4)
 
 
 def test_the_page_shows_bars_paper_and_clips(folder: Path) -> None:

@@ -92,9 +92,7 @@ def test_few_frames_are_drawn_where_that_is_slow() -> None:
     texts = ("put the red block in the blue bowl",)
     sampled = [SampledScene(StudyScene("test", seed, ()), seen, {}, texts) for seed in (0, 1)]
     subject = Subject("a", WorldModel(build(PLACED)), ("predict", "decode", "all"), drawn=4)
-    asked = [
-        (phase, t, b) for phase in ("encode", "predict", "decode", "all") for t in (2, 4, 9) for b in (1, 2)
-    ]
+    asked = [(phase, t, b) for phase in ("encode", "predict", "decode", "all") for t in (2, 4, 9) for b in (1, 2)]
     done = {what for what in asked if subject.work(Timing(*what, 1), sampled) is not None}
     # Nine frames are beyond this model, encoding was not asked for, and 4 frames of 2 scenes are too many to draw.
     assert done == {("predict", t, b) for t in (2, 4) for b in (1, 2)} | {

@@ -86,9 +86,7 @@ def test_finished_runs_are_skipped(args: Args, capsys: pytest.CaptureFixture) ->
     assert (args.out / "base" / "checkpoint" / "model.safetensors").stat().st_mtime_ns == before
 
 
-def test_a_run_with_other_settings_is_not_taken_for_this_one(
-    args: Args, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_run_with_other_settings_is_not_taken_for_this_one(args: Args, capsys: pytest.CaptureFixture) -> None:
     args.only = ("base",)
     main(args)
     (args.out / "base").rename(args.out / "layers-1")

@@ -115,19 +115,14 @@ class OracleWorldModel:
             middle = position if layer == BLOCK else position + np.array([0, 0, BOWL_HEIGHT / 2])
             slots.append(self._slot(layer, middle, 0.92 * np.array(COLORS[item["color"]])))
         slots += [self._slot(BLOCK, [0.5, 0, 0], (0.5, 0.5, 0.5), presence=0.0)] * self.spare_slots
-        order = (
-            np.random.default_rng(seed).permutation(len(slots) - 1) + 1
-        )  # the slot's number must not matter
+        order = np.random.default_rng(seed).permutation(len(slots) - 1) + 1  # the slot's number must not matter
         slots_KD = torch.stack([slots[0], *(slots[i] for i in order)])
         return self._rollout(slots_KD[None, None], ())
 
     def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         self.calls.append(len(text))
         starts_BKD = obs.slots[:, -1].expand(len(text), -1, -1)
-        films = [
-            self._imagine(start, Instruction.parse(t), horizon)
-            for start, t in zip(starts_BKD, text, strict=True)
-        ]
+        films = [self._imagine(start, Instruction.parse(t), horizon) for start, t in zip(starts_BKD, text, strict=True)]
         return self._rollout(torch.stack(films), tuple(text))
 
     def _imagine(self, start_KD: Tensor, instruction: Instruction, horizon: int) -> Tensor:
@@ -138,9 +133,7 @@ class OracleWorldModel:
         offset_2 = self.offsets.get(instruction.relation, (0.0, 0.0))
         place = np.array([*(place[:2] + offset_2), 0.006 + BLOCK_SIZE / 2])
         up, top = np.array([0, 0, 0.15]), np.array([0, 0, BLOCK_SIZE / 2 + 0.01])
-        tip_T3 = _path(
-            [HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1
-        )
+        tip_T3 = _path([HOME, pick + up, pick + top, pick + up, place + up, place + top, place + up, HOME], horizon + 1)
         film_TKD = start_KD[None].repeat(horizon + 1, 1, 1)
         film_TKD[1:, arm] = self._slots(ARM, tip_T3[1:], PALETTE.robot)
         if color not in self.hands_off:

@@ -28,9 +28,7 @@ def test_agrees_with_the_environments_camera(preset: str) -> None:
 
 def test_metres_per_pixel_is_the_width_of_a_pixel(camera: PinholeCamera) -> None:
     left, right = camera.unproject_to_plane([[31.5, 30.0], [32.5, 30.0]], 0.03)
-    assert camera.metres_per_pixel([32.0, 30.0], 0.03) == pytest.approx(
-        np.linalg.norm(right - left), rel=1e-6
-    )
+    assert camera.metres_per_pixel([32.0, 30.0], 0.03) == pytest.approx(np.linalg.norm(right - left), rel=1e-6)
 
 
 def test_a_ray_that_misses_the_plane_is_an_error(camera: PinholeCamera) -> None:
@@ -73,12 +71,7 @@ def test_a_stack_leans_and_is_as_high_as_the_camera_shows_it(size: int, at: tupl
     )
     lower_2, upper_2 = torch.tensor(lower), torch.tensor(upper)
     off = float(RELATIONS["on"].distance_of_places(upper_2, lower_2, view))
-    assert (
-        off
-        < 1.0
-        < RELATIONS["on"].within_px
-        < float(RELATIONS["on"].distance_of_places(lower_2, lower_2, view))
-    )
+    assert off < 1.0 < RELATIONS["on"].within_px < float(RELATIONS["on"].distance_of_places(lower_2, lower_2, view))
     assert float(view.raised(torch.tensor([0.0, -1.0]), lower_2)[0]) * at[1] >= 0, "outwards"
 
 

@@ -27,9 +27,7 @@ def with_slots(parsed: Rollout, slots: torch.Tensor) -> Rollout:
     return Rollout(slots, (), parsed.image_size, parsed.layout, parsed.renderer)
 
 
-def test_every_thing_is_found_whatever_its_slot(
-    oracle: OracleWorldModel, objects, camera: PinholeCamera
-) -> None:
+def test_every_thing_is_found_whatever_its_slot(oracle: OracleWorldModel, objects, camera: PinholeCamera) -> None:
     for seed in range(5):
         parsed = oracle.parse(BLACK, seed=seed)
         grounding = AppearanceGrounder(camera, PALETTE)(parsed)

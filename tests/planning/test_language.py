@@ -10,9 +10,7 @@ def test_instruction_text_round_trip() -> None:
     assert Instruction.parse(instruction.text) == instruction
 
 
-@pytest.mark.parametrize(
-    "text", ["", "put the red block in the blue bowl and the green block in the gray bowl"]
-)
+@pytest.mark.parametrize("text", ["", "put the red block in the blue bowl and the green block in the gray bowl"])
 def test_instruction_wants_exactly_one_pair(text: str) -> None:
     with pytest.raises(ValueError, match="expected one"):
         Instruction.parse(text)
@@ -46,10 +44,7 @@ def test_a_goal_is_read_as_a_whole_or_refused_with_its_text_and_the_forms(text: 
         Goal.parse(text)
     message = str(refused.value)
     assert f"cannot read {unread!r} in the goal {text!r}" in message
-    assert (
-        "'put the <color> block in the <color> bowl' or 'put the <color> block on the <color> block'"
-        in message
-    )
+    assert "'put the <color> block in the <color> bowl' or 'put the <color> block on the <color> block'" in message
 
 
 def test_a_goal_of_several_sentences_in_capitals_with_names_of_two_words() -> None:
@@ -63,9 +58,7 @@ def test_goal_is_checked() -> None:
         Goal.parse("")
     with pytest.raises(ValueError, match="each thing once"):
         Goal((put_in("red", "blue"), put_in("red", "gray")))
-    with pytest.raises(
-        ValueError, match="'put the red block in the red bowl' names two things of one colour"
-    ):
+    with pytest.raises(ValueError, match="'put the red block in the red bowl' names two things of one colour"):
         Goal.parse("put the red block in the red bowl")
     with pytest.raises(ValueError, match="'octarine' in the goal 'put the octarine block in the blue bowl'"):
         Goal.parse("put the octarine block in the blue bowl")

@@ -139,9 +139,7 @@ def test_random_choices_mostly_fail(env: gym.Env[Any, Any]) -> None:
 
 def test_what_cannot_be_grounded_ends_the_episode_with_a_reason(env: gym.Env[Any, Any]) -> None:
     planner = one_step(oracle_for(env, 0))
-    missing = next(
-        color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env))
-    )
+    missing = next(color for color in ("pink", "orange", "purple", "white") if color not in str(objects_now(env)))
     result = run_episode(env, planner, Goal((put_in(missing, "teal"),)), seed=0)
     assert not result.success and result.steps == 0
     assert result.error is not None and f"no {missing} block" in result.error
@@ -169,9 +167,7 @@ def test_ground_and_controller_are_the_callers(env: gym.Env[Any, Any]) -> None:
 
         return swapped
 
-    result = run_episode(
-        env, one_step(oracle), ground=confused, seed=3, options={"n_bowls": 2}, max_attempts=1
-    )
+    result = run_episode(env, one_step(oracle), ground=confused, seed=3, options={"n_bowls": 2}, max_attempts=1)
     assert not result.success and result.believes_reached and result.attempts[0].plan.best.reaches_goal
     assert len(looks) == 2 and looks[0] is not looks[1], "one for the plan, one for the look after it"
 
@@ -181,9 +177,7 @@ def test_ground_and_controller_are_the_callers(env: gym.Env[Any, Any]) -> None:
             x, y = right.pick
             return PickAndPlace((x - 0.1 if x > 0.5 else x + 0.1, y), right.place)
 
-    missed = run_episode(
-        env, one_step(oracle), controller=Beside, seed=3, options={"n_bowls": 2}, max_attempts=1
-    )
+    missed = run_episode(env, one_step(oracle), controller=Beside, seed=3, options={"n_bowls": 2}, max_attempts=1)
     assert not missed.success and not missed.believes_reached and missed.gained == 0.0
     usual = run_episode(env, one_step(oracle), seed=3, options={"n_bowls": 2}, max_attempts=1)
     assert usual.success

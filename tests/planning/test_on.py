@@ -39,9 +39,7 @@ def test_masks_show_what_stands_on_what() -> None:
     for seed in range(40):
         _, info = env.reset(seed=seed, options={"family": ("picture", "covered")[seed % 2]})
         masks = {
-            item["id"]: info["segmentation"] == item["label"]
-            for item in info["objects"]
-            if item["kind"] == "block"
+            item["id"]: info["segmentation"] == item["label"] for item in info["objects"] if item["kind"] == "block"
         }
         for thing, target in permutations(masks, 2):
             truth = bool(info["supports"][thing] == target)
@@ -75,9 +73,7 @@ def test_supports_are_seen_on_the_table_of_cliport(size: int) -> None:
             named = [Thing(one["color"], one["kind"]) for one in info["objects"]]
             truth = {one: None if at < 0 else named[at] for one, at in zip(named, info["supports"], strict=True)
                      if one.kind == "block"}  # fmt: skip
-            labels_NHW = torch.as_tensor(
-                np.stack([info["segmentation"] == one["label"] for one in info["objects"]])
-            )
+            labels_NHW = torch.as_tensor(np.stack([info["segmentation"] == one["label"] for one in info["objects"]]))
             view = SegmentationGrounder.from_info(info).view
             right.append(seen_supports(centroids(labels_NHW)[None], named, view)[0] == truth)
             stacked += sum(at is not None for at in truth.values())

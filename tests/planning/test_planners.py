@@ -31,9 +31,7 @@ def test_the_best_instruction_is_the_goals(oracle: OracleWorldModel, grounder, b
 
 def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera, grounder) -> None:
     oracle = OracleWorldModel(lambda: objects, camera, hands_off=["red"])
-    plan = BeamPlanner(oracle, **ONE_STEP).plan(
-        RGB, Goal.parse("put the red block in the blue bowl"), grounder
-    )
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(RGB, Goal.parse("put the red block in the blue bowl"), grounder)
     assert not any(candidate.reaches_goal for candidate in plan.ranking)
 
 
@@ -116,9 +114,7 @@ def test_sequences_leave_alone_what_is_done(oracle: OracleWorldModel, objects, g
 
 
 def test_controller_reads_the_rollout(oracle: OracleWorldModel, camera, grounder) -> None:
-    plan = BeamPlanner(oracle, **ONE_STEP).plan(
-        RGB, Goal.parse("put the red block in the gray bowl"), grounder
-    )
+    plan = BeamPlanner(oracle, **ONE_STEP).plan(RGB, Goal.parse("put the red block in the gray bowl"), grounder)
     action = Controller(camera).act(plan.rollout, plan.grounding, plan.instruction)
     np.testing.assert_allclose(action.pick, (0.45, -0.12), atol=0.01)
     np.testing.assert_allclose(action.place, (0.42, 0.08), atol=0.01)

@@ -69,15 +69,11 @@ def test_a_new_relation_is_planned_scored_and_carried_out(
     goal = Goal((beside,))
     plan = BeamPlanner(oracle).plan(RGB, goal, grounder)
     assert plan.instruction == beside
-    assert [candidate.reaches_goal for candidate in plan.ranking] == [True, False], (
-        "beside green, beside orange"
-    )
+    assert [candidate.reaches_goal for candidate in plan.ranking] == [True, False], "beside green, beside orange"
     scene = BeamPlanner(oracle, candidates="scene").plan(RGB, goal, grounder)
     firsts = {candidate.instructions[0] for candidate in scene.ranking}
     blocks = plan.grounding.of_kind("block")
-    assert firsts == {Instruction("beside", a, b) for a in blocks for b in blocks if a != b}, (
-        "and none of `in`"
-    )
+    assert firsts == {Instruction("beside", a, b) for a in blocks for b in blocks if a != b}, "and none of `in`"
 
     trace = measure_rollout(plan.rollout, plan.grounding, beside)
     assert trace.within_B.tolist() == [3.0] and SuccessCriterion()(trace).all()

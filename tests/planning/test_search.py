@@ -79,9 +79,7 @@ class Physics(OracleWorldModel):
     def _top(self, slots_KD: Tensor, at: int) -> int:
         """The highest block over a thing, or the thing."""
         near_K = (slots_KD[:, :2] - slots_KD[at, :2]).norm(dim=-1) < 0.02
-        above = [
-            k for k in range(len(slots_KD)) if near_K[k] and slots_KD[k, 3] == BLOCK and slots_KD[k, -1] > 0.5
-        ]
+        above = [k for k in range(len(slots_KD)) if near_K[k] and slots_KD[k, 3] == BLOCK and slots_KD[k, -1] > 0.5]
         return max([at, *above], key=lambda k: float(slots_KD[k, 2] - (slots_KD[k, 3] == BOWL).float()))
 
 
@@ -108,9 +106,7 @@ def test_a_taken_bowl_is_emptied_first(occupied, physics: Physics, grounder: App
     assert first.thing == GREEN and first.target.kind == "bowl" and first.target != BLUE
     assert second == put_in("red", "blue") and plan.best.reaches_goal
     assert [len(rollout.slots[0]) for rollout in plan.rollouts] == [2, 2]
-    assert torch.equal(plan.rollouts[0].slots[:, -1], plan.rollouts[1].slots[:, 0]), (
-        "one goes on where one ends"
-    )
+    assert torch.equal(plan.rollouts[0].slots[:, -1], plan.rollouts[1].slots[:, 0]), "one goes on where one ends"
     believed = BelievingPlanner(physics).plan(RGB, goal, grounder)
     assert believed.best.instructions == (put_in("red", "blue"),) and believed.best.reaches_goal
     said = LiteralPlanner(physics).plan(RGB, goal, grounder)

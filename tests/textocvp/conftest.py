@@ -73,9 +73,7 @@ NON_OC = ModelConfig(
     ),
     renderer=UpsampleConfig(channels=8),
     text=SMALL_TEXT,
-    predictor=TextOCVPConfig(
-        dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, standardize=True
-    ),
+    predictor=TextOCVPConfig(dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8, standardize=True),
 )
 
 

@@ -45,7 +45,7 @@ def test_the_files_hold_no_pickle(folder: Path) -> None:
 
 
 SHA256 = {
-    "cater": "51b5e27052f80eddc51b94124fd55bfedff656fb3fa1427520c33430e9f33df3",
+    "cater": "2d79ac91b5d7077b7bb574ba1aa8ce557e24dd45e7566c0797cceaa9ff32bdc8",
     "cliport": "80f54754298e836cf9b42d817e7468ca3e2f4dda0b01ba64a80cfeccb11517e5",
     "mage-small": "aa57385cef278bc051bc5c3e0479486c2c8a275d557bf476d57cc3a6c6a9c6dd",
     "non-oc-small": "4e1d6426c7f11faff46fa73a73627c6b60b60b458ebd1db6148a0db75fbf2d6d",
@@ -63,18 +63,14 @@ def test_a_bundled_checkpoint_is_read_by_its_name(name: str) -> None:
         assert json.loads((folder / "config.json").read_text())["weights_sha256"] == SHA256[name]
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in bundled_checkpoints() if name not in ("mage-small", "cater")]
-)
+@pytest.mark.parametrize("name", [name for name in bundled_checkpoints() if name not in ("mage-small", "cater")])
 def test_bundled_words_are_the_tensors_rows_and_untrained_ones_are_warned_about(name: str) -> None:
     text = TextOCVP.from_pretrained(name).text
     rows = text.embedding.weight
     assert len(text.config.vocabulary) == len(rows) - len(SPECIAL) == 15
     assert text.unknown_words("put the red block in the blue bowl") == []
     assert text.unknown_words("with the red block to the blue bowl") == ["with", "to"]
-    assert all(
-        word in text.config.vocabulary for form in text.config.forms for word in form.split() if word != "{}"
-    )
+    assert all(word in text.config.vocabulary for form in text.config.forms for word in form.split() if word != "{}")
     # Training draws rows and moves those that it meets: two models of one seed agree in the others only.
     if name == "tabletop-small":
         other = TextOCVP.from_pretrained("ocvp-seq-small").text.embedding.weight
@@ -103,9 +99,7 @@ def test_another_word_in_a_preset_breaks_no_checkpoint(folder: Path, monkeypatch
     assert torch.equal(before, after)
     data = json.loads((folder / "config.json").read_text())
     change_config(folder, text={**data["text"], "vocabulary": [*data["text"]["vocabulary"], "stack"]})
-    with pytest.raises(
-        CheckpointError, match=r"'text\.embedding\.weight' is \(18, 16\).*model's is \(19, 16\)"
-    ):
+    with pytest.raises(CheckpointError, match=r"'text\.embedding\.weight' is \(18, 16\).*model's is \(19, 16\)"):
         TextOCVP.from_pretrained(folder)
 
 
@@ -141,18 +135,14 @@ def forget_hash(folder: Path) -> None:
 def test_an_unknown_config_field_is_named(folder: Path) -> None:
     data = json.loads((folder / "config.json").read_text())
     change_config(folder, predictor={**data["predictor"], "depth": 3})
-    with pytest.raises(
-        CheckpointError, match=r"config\.json: predictor has no field 'depth'; known: .*layers"
-    ):
+    with pytest.raises(CheckpointError, match=r"config\.json: predictor has no field 'depth'; known: .*layers"):
         TextOCVP.from_pretrained(folder)
 
 
 def test_an_impossible_config_value_is_named(folder: Path) -> None:
     data = json.loads((folder / "config.json").read_text())
     change_config(folder, renderer={**data["renderer"], "kind": "holographic"})
-    with pytest.raises(
-        CheckpointError, match=r"config\.json: renderer\.kind is 'holographic': must be one of glimpse"
-    ):
+    with pytest.raises(CheckpointError, match=r"config\.json: renderer\.kind is 'holographic': must be one of glimpse"):
         TextOCVP.from_pretrained(folder)
 
 

@@ -71,9 +71,7 @@ def test_words_without_quotes_are_one_sentence(capsys, tmp_path, checkpoint, pic
 
 
 def test_what_was_done_to_picture_and_words_is_said(capsys, tmp_path, checkpoint, scene) -> None:
-    wide = np.concatenate(
-        [np.full((32, 16, 3), 47, np.uint8), scene, np.full((32, 16, 3), 47, np.uint8)], axis=1
-    )
+    wide = np.concatenate([np.full((32, 16, 3), 47, np.uint8), scene, np.full((32, 16, 3), 47, np.uint8)], axis=1)
     iio.imwrite(tmp_path / "wide.png", wide)
     iio.imwrite(tmp_path / "scene.png", scene)
     arguments = [TEXT.upper(), "--checkpoint", checkpoint, "--horizon", "1", "--out"]

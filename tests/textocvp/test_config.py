@@ -15,9 +15,7 @@ from textocvp.renderers.patches import PatchConfig
 from textocvp.slots import SlotLayout
 
 
-@pytest.mark.parametrize(
-    "config", [*PRESETS.values(), *MAGE_PRESETS.values()], ids=lambda config: config.name
-)
+@pytest.mark.parametrize("config", [*PRESETS.values(), *MAGE_PRESETS.values()], ids=lambda config: config.name)
 def test_json_gives_the_configuration_back(config: Any) -> None:
     assert type(config).from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
@@ -46,9 +44,7 @@ def test_settings_reach_the_field_they_name_and_no_other() -> None:
 def test_a_kind_is_changed_first_and_keeps_what_both_kinds_have() -> None:
     settings = ["parser.iterations_first=3", "parser.layout.explicit=false", "parser.num_slots=9"]
     config = with_settings(preset("tabletop-small"), [*settings, "parser.kind=savi", "renderer.kind=patches"])
-    assert config.parser == SaviConfig(
-        num_slots=9, layout=SlotLayout(content=64, explicit=False), iterations_first=3
-    )
+    assert config.parser == SaviConfig(num_slots=9, layout=SlotLayout(content=64, explicit=False), iterations_first=3)
     assert config.renderer == PatchConfig(hidden=256)  # as wide as the glimpse renderer's
     with pytest.raises(ValueError, match=r"'savi' needs parser\.layout\.explicit = false"):
         with_settings(preset("tabletop-small"), ["parser.kind=savi"])
@@ -92,9 +88,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(setting: str, message:
         ("name", 7, "name is 7: must be of type str"),
     ],
 )
-def test_a_value_of_json_that_makes_no_sense_is_refused_by_name(
-    part: str, value: object, message: str
-) -> None:
+def test_a_value_of_json_that_makes_no_sense_is_refused_by_name(part: str, value: object, message: str) -> None:
     data = preset("tabletop-small").to_dict()
     with pytest.raises(ValueError, match=message):
         ModelConfig.from_dict({**data, part: value})
@@ -102,9 +96,7 @@ def test_a_value_of_json_that_makes_no_sense_is_refused_by_name(
         ModelConfig.from_dict({"stage": "parser"})
 
 
-@pytest.mark.parametrize(
-    ("preset_name", "slots"), [("tabletop-small", 1), ("savi-small", 1), ("cliport", 10**9)]
-)
+@pytest.mark.parametrize(("preset_name", "slots"), [("tabletop-small", 1), ("savi-small", 1), ("cliport", 10**9)])
 def test_slot_counts_without_sense_are_refused_before_anything_is_built(preset_name: str, slots: int) -> None:
     with pytest.raises(ValueError, match=rf"parser\.num_slots .*{slots}"):
         with_settings(preset(preset_name), [f"parser.num_slots={slots}"])

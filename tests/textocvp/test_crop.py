@@ -11,9 +11,7 @@ def test_what_is_cropped_is_pasted_back_where_it_was() -> None:
     image = torch.zeros(1, 1, 1, 64, 64)
     image[..., 20:32, 36:46] = 1
     center = torch.tensor([[[(41 / 64) * 2 - 1, (26 / 64) * 2 - 1]]])
-    scale = torch.tensor(
-        [[[10 / 64 / 3**0.5, 12 / 64 / 3**0.5]]]
-    )  # deviation of a uniform box: side / sqrt(12)
+    scale = torch.tensor([[[10 / 64 / 3**0.5, 12 / 64 / 3**0.5]]])  # deviation of a uniform box: side / sqrt(12)
     back = paste(crop(image, center, scale, 24, 2.6), center, scale, 64, 64, 2.6)
     assert (back - image).abs().mean() < 0.01
     assert torch.equal((back > 0.5).float(), image)

@@ -32,9 +32,7 @@ def squares(side: int) -> np.ndarray:
 def test_placed_slots_find_as_many_things_as_there_are_slots() -> None:
     world_model = WorldModel(build(PLACED))
     few, many = squares(2), squares(4)
-    found = [
-        int((world_model.parse(many[None], num_slots=k).presence > 0.5).sum()) for k in (None, 9, 17, 20)
-    ]
+    found = [int((world_model.parse(many[None], num_slots=k).presence > 0.5).sum()) for k in (None, 9, 17, 20)]
     assert found == [5, 9, 17, 17]  # the canvas is one of them
     trained, raised = (world_model.rollout(few, TEXT, horizon=4, num_slots=k) for k in (None, 12))
     assert raised.slots.shape == (1, 5, 12, 16)

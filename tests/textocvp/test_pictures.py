@@ -80,14 +80,10 @@ def test_another_shape_gets_a_border_or_loses_its_edges(scene: np.ndarray, tmp_p
     wide = np.full((64, 128, 3), 47, np.uint8)
     wide[:, 32:96] = scene.repeat(2, axis=0).repeat(2, axis=1)
     path = saved(tmp_path / "wide.png", Image.fromarray(wide))
-    with pytest.raises(
-        ValueError, match=r"128x64 pixels and the model was trained on 32x32: .*--resize .*--crop"
-    ):
+    with pytest.raises(ValueError, match=r"128x64 pixels and the model was trained on 32x32: .*--resize .*--crop"):
         read_picture(path, SIZE)
     cropped, said = read_picture(path, SIZE, crop=True)
-    assert np.array_equal(cropped, scene) and said == [
-        "cut off its edges and brought it from 128x64 to 32x32 pixels"
-    ]
+    assert np.array_equal(cropped, scene) and said == ["cut off its edges and brought it from 128x64 to 32x32 pixels"]
     padded, said = read_picture(path, SIZE, resize=True)
     assert said == ["added a border and brought it from 128x64 to 32x32 pixels"]
     # The shape of things stays: half as large, in the middle, and the border has the colour of the edge.

@@ -144,9 +144,7 @@ def test_places_and_colours_are_read_off_slots_that_say() -> None:
     )
     rollout = Rollout(state.join(), ("go",), (H, W), PLACED, BoxRenderer())
     # The centre of the top-left pixel is (0.5, 0.5), so the bottom-left one's is (0.5, H - 0.5).
-    torch.testing.assert_close(
-        rollout.positions[0, 0], torch.tensor([[0.0, 0], [W / 2, H / 2], [0.5, H - 0.5]])
-    )
+    torch.testing.assert_close(rollout.positions[0, 0], torch.tensor([[0.0, 0], [W / 2, H / 2], [0.5, H - 0.5]]))
     torch.testing.assert_close(rollout.colors[0, 0, 0], torch.tensor([0.0, 0.5, 1.0]))
     assert rollout.presence.tolist() == [[[1, 1, 0]]]
     assert renderer_of(rollout).pictures == 0
@@ -233,9 +231,7 @@ def test_a_strip_shows_moments_side_by_side_and_real_frames_above(tmp_path: Path
     real = np.full((2, H, W, 3), 200, np.uint8)
     real[1] = 90
     beside = iio.imread(rollout.save(tmp_path / "beside.png", beside=real))
-    assert beside.shape[0] == plain.shape[0] + 4 * H + 4 and beside.shape[1] == plain.shape[1] == 4 * (
-        4 * W + 4
-    )
+    assert beside.shape[0] == plain.shape[0] + 4 * H + 4 and beside.shape[1] == plain.shape[1] == 4 * (4 * W + 4)
     tops = [beside[10, t * (4 * W + 4) + 10, 0] for t in range(4)]
     assert tops == [200, 90, 90, 90]  # the last real frame stays
 

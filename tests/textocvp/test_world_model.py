@@ -53,14 +53,10 @@ def test_the_same_seed_gives_the_same_rollout(world_model: WorldModel, scene: np
     b = world_model.rollout(scene, TEXT, horizon=3, seed=5)
     assert torch.equal(a.slots, b.slots)
     if world_model.model.config.parser.kind == "savi":
-        assert not torch.allclose(
-            a.slots, world_model.rollout(scene, TEXT, horizon=3, seed=6).slots, atol=1e-3
-        )
+        assert not torch.allclose(a.slots, world_model.rollout(scene, TEXT, horizon=3, seed=6).slots, atol=1e-3)
 
 
-def test_one_scene_and_many_texts_are_one_parse_and_one_batch(
-    world_model: WorldModel, scene: np.ndarray
-) -> None:
+def test_one_scene_and_many_texts_are_one_parse_and_one_batch(world_model: WorldModel, scene: np.ndarray) -> None:
     texts = [TEXT, "put the blue block in the red bowl", TEXT]
     parses: list[int] = []
     world_model.model.parser.register_forward_hook(lambda *_: parses.append(1))
@@ -90,9 +86,7 @@ def test_a_rollout_goes_on_from_where_it_ended(world_model: WorldModel, scene: n
     first = world_model.rollout(scene, TEXT, horizon=2)
     then = world_model.rollout(first, [TEXT, "put the blue block in the red bowl"], horizon=3)
     assert then.slots.shape[:2] == (2, 4)
-    assert torch.equal(then.slots[0, 0], first.slots[0, -1]) and torch.equal(
-        then.slots[1, 0], first.slots[0, -1]
-    )
+    assert torch.equal(then.slots[0, 0], first.slots[0, -1]) and torch.equal(then.slots[1, 0], first.slots[0, -1])
     again = world_model.rollout(first.last, [TEXT], horizon=3)
     torch.testing.assert_close(again.slots[0], then.slots[0], atol=1e-5, rtol=1e-4)
 
@@ -107,9 +101,7 @@ def test_cached_and_uncached_agree(world_model: WorldModel, scene: np.ndarray) -
     texts, horizon = [TEXT, "put the cyan block in the gray bowl"], world_model.longest_horizon or 6
     cached, model = world_model.rollout(scene, texts, horizon=horizon).slots, world_model.model
     with torch.no_grad():
-        uncached = model.predictor.rollout(
-            cached[:, :1], model.text(texts), horizon, use_cache=False
-        ).slots_BSKD
+        uncached = model.predictor.rollout(cached[:, :1], model.text(texts), horizon, use_cache=False).slots_BSKD
     torch.testing.assert_close(cached[:, 1:], uncached, atol=1e-4, rtol=1e-3)
 
 
@@ -174,9 +166,7 @@ def test_texts_must_be_text(placed_world_model, scene) -> None:
         placed_world_model.rollout(scene, [TEXT, 3])
 
 
-@pytest.mark.parametrize(
-    ("horizon", "says"), [(0, "at least 1"), (-3, "-3"), (2.5, "2.5"), (9, "at most 8.*go on")]
-)
+@pytest.mark.parametrize(("horizon", "says"), [(0, "at least 1"), (-3, "-3"), (2.5, "2.5"), (9, "at most 8.*go on")])
 def test_impossible_horizons_are_refused(placed_world_model, scene, horizon, says) -> None:
     with pytest.raises(ValueError, match=says):
         placed_world_model.rollout(scene, TEXT, horizon=horizon)
@@ -196,13 +186,9 @@ def test_a_word_it_has_never_met_is_a_warning_that_names_it(placed_world_model, 
         placed_world_model.rollout(scene, TEXT, horizon=1)
 
 
-def test_a_thing_that_nothing_answers_to_is_a_warning_that_names_the_nearest(
-    placed_world_model, scene
-) -> None:
+def test_a_thing_that_nothing_answers_to_is_a_warning_that_names_the_nearest(placed_world_model, scene) -> None:
     text, again = "put the green block in the blue bowl", "put the red block in the blue bowl"
-    with pytest.warns(
-        UserWarning, match="nothing seen is 'green'; the nearest is '(blue|red)' and"
-    ) as caught:
+    with pytest.warns(UserWarning, match="nothing seen is 'green'; the nearest is '(blue|red)' and") as caught:
         seen = placed_world_model.rollout(scene, [again, text], horizon=1)
     assert repr(text) in str(caught[0].message) and len(caught) == 1
     assert Path(caught[0].filename).name == "test_world_model.py"  # points at the caller
@@ -264,9 +250,7 @@ def test_a_folder_is_a_checkpoint(tmp_path: Path, scene: np.ndarray) -> None:
 
 
 def test_an_unknown_checkpoint_lists_those_there_are(tmp_path: Path) -> None:
-    with pytest.raises(
-        CheckpointError, match=r"'tabletop-smal'.*Bundled.*config\.json and model\.safetensors"
-    ):
+    with pytest.raises(CheckpointError, match=r"'tabletop-smal'.*Bundled.*config\.json and model\.safetensors"):
         WorldModel.from_pretrained("tabletop-smal")
     with pytest.raises(CheckpointError, match="unknown checkpoint"):
         WorldModel.from_pretrained(tmp_path / "nowhere")
@@ -289,9 +273,7 @@ def test_a_hub_id_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert WorldModel.from_pretrained("someone/model").checkpoint.name == "someone/model"
 
 
-@pytest.mark.skipif(
-    "tabletop-small" not in bundled_checkpoints(), reason="the trained checkpoint is not there yet"
-)
+@pytest.mark.skipif("tabletop-small" not in bundled_checkpoints(), reason="the trained checkpoint is not there yet")
 def test_the_bundled_checkpoint_loads_and_imagines() -> None:
     world_model = WorldModel.from_pretrained()
     H, W = world_model.image_size

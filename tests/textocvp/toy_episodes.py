@@ -20,9 +20,7 @@ def sentence(block: str, bowl: str) -> str:
     return f"put the {block} block in the {bowl} bowl"
 
 
-def write_toy_episodes(
-    path: Path, lengths: list[int], seed: int = 0, *, version: int = 2, truth: bool = True
-) -> Path:
+def write_toy_episodes(path: Path, lengths: list[int], seed: int = 0, *, version: int = 2, truth: bool = True) -> Path:
     """Write 32x32 episodes: two blocks, two bowls, an arm that carries the first block to the first bowl.
 
     Without `truth` there are only frames and sentences.

@@ -126,9 +126,7 @@ def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: I
     if not episode.instruction.strip():
         raise OwnVideosError("an episode has no sentence")
     if size is None and H != W:
-        raise OwnVideosError(
-            f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)"
-        )
+        raise OwnVideosError(f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)")
     if size not in (None, H) or H != W:
         frames, said = to_square(episode.frames, size or H, crop)
         episode = replace(episode, frames=frames, segmentation=None, position=None, objects=(), questions=())
@@ -252,12 +250,8 @@ def _to_lerobot(episodes: EpisodeFile, out: Path, fps: int) -> list[str]:
     }  # fmt: skip
     (out / "meta/episodes/chunk-000").mkdir(parents=True)
     (out / "meta/info.json").write_text(json.dumps(info, indent=4))
-    (out / "meta/stats.json").write_text(
-        json.dumps({name: of.values() for name, of in stats.items()}, indent=4)
-    )
-    kept = [
-        {name: v for name, v in row.items() if not name.startswith(OURS) or v is not None} for row in listed
-    ]
+    (out / "meta/stats.json").write_text(json.dumps({name: of.values() for name, of in stats.items()}, indent=4))
+    kept = [{name: v for name, v in row.items() if not name.startswith(OURS) or v is not None} for row in listed]
     parquet.write_table(pa.Table.from_pylist(kept), out / "meta/episodes/chunk-000/file-000.parquet")
     table = pa.table({"task_index": range(len(tasks)), "task": tasks})
     # LeRobot reads it with pandas, and the sentences as the table's index.
@@ -274,9 +268,7 @@ def _to_lerobot(episodes: EpisodeFile, out: Path, fps: int) -> list[str]:
         "columns": [column],
         "pandas_version": "2.0.0",
     }
-    parquet.write_table(
-        table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet"
-    )
+    parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet")
     return []
 
 
@@ -310,9 +302,7 @@ class _Stats:
 
     def values(self) -> dict[str, Any]:
         """As in `meta/stats.json`."""
-        frames, counts, sums, squares, least, most = (
-            np.stack(part) for part in zip(*self.parts, strict=True)
-        )
+        frames, counts, sums, squares, least, most = (np.stack(part) for part in zip(*self.parts, strict=True))
         mean = sums.sum(0) / counts.sum()
         std = np.sqrt(np.maximum(squares.sum(0) / counts.sum() - mean**2, 0))
         found = {"min": least.min(0), "max": most.max(0), "mean": mean, "std": std}
@@ -338,9 +328,7 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
         tables = [parquet.read_table(path) for path in sorted((source / "meta/episodes").glob("*/*.parquet"))]
         listed = [row for table in tables for row in table.to_pylist()]
     if len(listed) != info["total_episodes"]:
-        raise OwnVideosError(
-            f"info.json promises {info['total_episodes']} episodes, and {len(listed)} are listed"
-        )
+        raise OwnVideosError(f"info.json promises {info['total_episodes']} episodes, and {len(listed)} are listed")
     film = _Film()
     for row in listed:
         index = row["episode_index"]
@@ -349,9 +337,7 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
         path = source / info["data_path"].format(**where)
         table = parquet.read_table(path, filters=[("episode_index", "=", index)])
         if table.num_rows != row["length"]:
-            raise OwnVideosError(
-                f"{path}: {table.num_rows} frames of episode {index}, and {row['length']} are listed"
-            )
+            raise OwnVideosError(f"{path}: {table.num_rows} frames of episode {index}, and {row['length']} are listed")
         if features[camera]["dtype"] == "image":
             frames = np.stack([_picture(source, cell) for cell in table[camera].to_pylist()])
         else:
@@ -410,9 +396,7 @@ class _Film:
 
 def _minari_data(source: Path) -> Path | None:
     for folder in (source / "data", source):
-        if (folder / "metadata.json").is_file() and "observation_space" in (
-            folder / "metadata.json"
-        ).read_text():
+        if (folder / "metadata.json").is_file() and "observation_space" in (folder / "metadata.json").read_text():
             return folder
     return None
 
@@ -428,9 +412,7 @@ def _to_minari(episodes: EpisodeFile, out: Path, name: str) -> list[str]:
         )
     spaces: dict[str, Any] = {
         "rgb": gym.spaces.Box(0, 255, (side, side, 3), np.uint8),
-        "instruction": gym.spaces.Text(
-            max(map(len, episodes.instructions)), charset="".join(sorted(set(text)))
-        ),
+        "instruction": gym.spaces.Text(max(map(len, episodes.instructions)), charset="".join(sorted(set(text)))),
     }
     if first.state is not None:
         spaces["proprio"] = gym.spaces.Box(-np.inf, np.inf, first.state.shape[1:], np.float32)
@@ -481,9 +463,7 @@ def _from_minari(source: Path, done: Imported) -> Iterator[Episode]:
     if storage.jpeg_encoding:
         done.say("this set", ["its frames were stored as JPEG, so they are not what was seen bit for bit"])
     numbers = range(storage.total_episodes)
-    for found, known in zip(
-        storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True
-    ):
+    for found, known in zip(storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True):
         seen, options = found["observations"], known.get("options", {})
         seen = seen if isinstance(seen, dict) else {"": seen}
         columns: dict[str, Any] = {}

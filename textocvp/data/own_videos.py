@@ -44,9 +44,7 @@ class Imported:
     episodes: int = 0
     frames: int = 0
     left_out: list[str] = field(default_factory=list)  # a line for each video that was not taken
-    done: dict[str, list[str]] = field(
-        default_factory=dict
-    )  # what had to be changed or is doubtful: of which videos
+    done: dict[str, list[str]] = field(default_factory=dict)  # what had to be changed or is doubtful: of which videos
 
     def say(self, name: str, what: Sequence[str]) -> None:
         """Note what was done to a video."""
@@ -57,9 +55,7 @@ class Imported:
     @property
     def lines(self) -> list[str]:
         """A line for each thing that was done, with the first video of which it is true."""
-        more = {
-            what: f" and {len(names) - 1} more" if len(names) > 1 else "" for what, names in self.done.items()
-        }
+        more = {what: f" and {len(names) - 1} more" if len(names) > 1 else "" for what, names in self.done.items()}
         return [f"{names[0]}{more[what]}: {what}" for what, names in self.done.items()]
 
 
@@ -74,9 +70,7 @@ def read_captions(folder: Path) -> dict[str, str]:
     """
     path = next((folder / name for name in CAPTIONS if (folder / name).is_file()), None)
     if path is None:
-        raise OwnVideosError(
-            f"{folder} has no captions: one of {', '.join(CAPTIONS)} must say what happens in each"
-        )
+        raise OwnVideosError(f"{folder} has no captions: one of {', '.join(CAPTIONS)} must say what happens in each")
     try:
         text = path.read_text(encoding="utf-8-sig")
         if path.suffix == ".json":
@@ -112,9 +106,7 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
     videos = [one for one in _seen(source) if one.suffix.lower() in VIDEOS or one.is_dir()]
     if not videos:
         raise OwnVideosError(f"{source} has no video ({', '.join(VIDEOS)}) and no folder of pictures")
-    done.episodes, done.frames = write_episodes(
-        out, _read_videos(source, videos, captions, size, crop, every, done)
-    )
+    done.episodes, done.frames = write_episodes(out, _read_videos(source, videos, captions, size, crop, every, done))
     return done
 
 
@@ -177,9 +169,7 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             columns |= {name: v for name in ("seed", "success") if (v := getattr(episode, name)) is not None}
             lists = {"primitives": episode.primitives} if episode.action is not None else {}
             lists |= {name: v for name in ("objects", "questions") if (v := getattr(episode, name))}
-            columns |= {
-                n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()
-            }
+            columns |= {n: json.dumps([getattr(i, "_asdict", lambda i=i: i)() for i in v]) for n, v in lists.items()}
             if number == 0:
                 robot, rows = episode.robot, {name: [] for name in columns}
                 for name, values in arrays.items():
@@ -189,9 +179,7 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
                         chunks=(4 if image else 256, *shape), compression="gzip" if image else None,
                     )  # fmt: skip
             if lacking := {*rows, *file} - {*columns, *arrays}:
-                raise OwnVideosError(
-                    f"episode {number} has no {min(lacking)}, and the first has: all must be alike"
-                )
+                raise OwnVideosError(f"episode {number} has no {min(lacking)}, and the first has: all must be alike")
             for name in file:
                 if arrays[name].shape[1:] != file[name].shape[1:]:
                     raise OwnVideosError(
@@ -205,9 +193,7 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             content.update(episode.frames.tobytes())
         if not rows:
             raise OwnVideosError("there is no episode")
-        config = json.dumps(
-            {"frames": content.hexdigest()}
-        )  # by which caches know that a frame was corrected
+        config = json.dumps({"frames": content.hexdigest()})  # by which caches know that a frame was corrected
         file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSIONS[-1], "config": config})
         if robot is not None and "segmentation" in file:
             file.attrs["labels"] = json.dumps({"background": 0, "robot": robot})
@@ -242,18 +228,14 @@ def read_video(path: Path, size: int, crop: bool, every: int) -> tuple[NDArray[n
         if (promised := _promised(path)) and count < min(HEADER_TRUST * promised, promised - 1):
             said.append(f"cut short: {count} of the {promised} frames that its header promises can be read")
         elif complaint := _complaint(path):
-            said.append(
-                f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}"
-            )
+            said.append(f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}")
     if not frames:
         return np.zeros((0, size, size, 3), np.uint8), said
     whole, how = to_square(np.stack(frames), size, crop)
     return whole, said + how
 
 
-def to_square(
-    frames_T: NDArray[np.uint8], size: int, crop: bool = False
-) -> tuple[NDArray[np.uint8], list[str]]:
+def to_square(frames_T: NDArray[np.uint8], size: int, crop: bool = False) -> tuple[NDArray[np.uint8], list[str]]:
     """Frames (T, size, size, 3), with a border or cut off, and what was done, in words."""
     if frames_T.shape[1:3] == (size, size):
         return frames_T, []
@@ -281,9 +263,7 @@ def _complaint(path: Path) -> str:
 
 def _by_number(path: Path) -> list[tuple[bool, int, str]]:
     """Sorts 2 before 10, whatever stands around the numbers."""
-    return [
-        (part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", path.name)
-    ]
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def video_frames(path: Path) -> Iterator[NDArray[np.uint8]]:

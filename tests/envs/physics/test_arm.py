@@ -92,9 +92,7 @@ def test_our_links_carry_the_meshes_as_the_ur5s_own_description_does(client: int
         as_ur = (pan - np.pi, lift, elbow, wrist1 - np.pi / 2, wrist2 - np.pi / 2, -wrist3)
         for index, angle in zip(revolute, as_ur, strict=True):
             p.resetJointState(theirs, index, angle, physicsClientId=client)
-        for link, (index, (name, turn, shift)) in enumerate(
-            zip(revolute, list(ur5._MESHES.values())[1:], strict=True)
-        ):
+        for link, (index, (name, turn, shift)) in enumerate(zip(revolute, list(ur5._MESHES.values())[1:], strict=True)):
             corners = ur5._read_stl(folder / f"{name}.stl").reshape(-1, 3)
             expected = placed(client, theirs, index, corners)
             found = placed(client, ours, link, corners @ turn.T + shift)
@@ -129,9 +127,7 @@ def test_without_its_package_the_arm_is_of_cylinders_and_says_so(monkeypatch: py
     assert 0.04 < share < 0.12  # as large as the real one, which has 7 %
 
 
-@pytest.mark.parametrize(
-    ("point", "message"), [((1.5, 0, 0.1), "out of the arm's reach"), ((0, 0, 0.1), "base")]
-)
+@pytest.mark.parametrize(("point", "message"), [((1.5, 0, 0.1), "out of the arm's reach"), ((0, 0, 0.1), "base")])
 def test_points_out_of_reach_are_refused(point: tuple[float, float, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SIMPLE.arm.inverse(point, 0.0)

@@ -159,9 +159,7 @@ def test_success_is_strict(env: TabletopEnv) -> None:
 
     assert say(env, "put the green block in the yellow bowl") == [1, TABLE, 0]
     assert not env._info()["is_success"], "the named block carries another, as at a covered start"
-    env.world.bullet.resetBasePositionAndOrientation(
-        env.world.objects[0], (0.5, 0.15, BLOCK / 2), [0, 0, 0, 1]
-    )
+    env.world.bullet.resetBasePositionAndOrientation(env.world.objects[0], (0.5, 0.15, BLOCK / 2), [0, 0, 0, 1])
     env.world.settle(60)
     assert not env._info()["is_success"], "the block is no longer in the bowl"
 
@@ -176,9 +174,7 @@ def test_a_fallen_block_spoils_a_picture(env: TabletopEnv) -> None:
     assert env._info()["is_success"]
     seen, picture = env._observe()["rgb"].astype(int), observation["goal_rgb"]
     assert (abs(seen - picture).max(-1) < 12).mean() > 0.99, "and it looks like the picture"
-    env.world.bullet.resetBasePositionAndOrientation(
-        env.world.objects[2], (0.6, 0.0, BLOCK / 2), [0, 0, 0, 1]
-    )
+    env.world.bullet.resetBasePositionAndOrientation(env.world.objects[2], (0.6, 0.0, BLOCK / 2), [0, 0, 0, 1])
     env.world.settle(60)
     assert env._fulfilled() == [True, True, False] and not env._info()["is_success"]
 

@@ -26,9 +26,7 @@ class Resources(html.parser.HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
-        self.found += [
-            value or "" for name, value in attrs if name in ("src", "srcset", "href", "data", "poster")
-        ]
+        self.found += [value or "" for name, value in attrs if name in ("src", "srcset", "href", "data", "poster")]
 
 
 def test_the_page_opens_offline() -> None:
@@ -96,9 +94,7 @@ def test_a_browser_shows_it(tmp_path: Path, width: int) -> None:
 
 
 def test_a_card_is_filled_from_a_row() -> None:
-    line = Line(
-        key="ours", paper=Paper("paper", {("controllability", "original", "predicted_success"): 0.83})
-    )
+    line = Line(key="ours", paper=Paper("paper", {("controllability", "original", "predicted_success"): 0.83}))
     column = Column("", "controllability", "original", "predicted_success")
     card = CardSpec("Predicted", line, column).fill(examples.results())
     assert (card.value, card.detail, card.compare) == ("0.90", "0.80\u20130.95, 20 scenes", "paper 0.83")

@@ -28,9 +28,7 @@ SPEC = TableSpec(
         Column("24 frames", "test", "24 frames", "ssim", 3),
     ],
     [
-        Line(
-            key="ours", note="imagined", paper=Paper("paper, TextOCVP", {("test", "9 frames", "ssim"): 0.95})
-        ),
+        Line(key="ours", note="imagined", paper=Paper("paper, TextOCVP", {("test", "9 frames", "ssim"): 0.95})),
         Line(key="MAGE", kind="baseline", hue=3),
         Line(key="OCVP-Seq", kind="baseline"),
     ],
@@ -88,9 +86,7 @@ def test_a_spec_is_filled_from_rows_and_the_paper_stands_below_its_line() -> Non
 
 
 def test_a_line_may_show_another_metric() -> None:
-    spec = TableSpec(
-        "", columns("", {"test": ("test", "9 frames")}), [Line(key="ours", metric="ssim", digits=1)]
-    )
+    spec = TableSpec("", columns("", {"test": ("test", "9 frames")}), [Line(key="ours", metric="ssim", digits=1)])
     assert spec.table(ROWS).rows[0].cells[0].text == "1.0"
 
 

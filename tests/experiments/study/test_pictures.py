@@ -105,11 +105,11 @@ def test_other_words_are_imagined_and_judged_by_the_same_wish() -> None:
 
     LoadOracle()()  # which listens to the environment
     worker = Worker(Deaf(()))
-    outcomes = [ChangedScene(scene, UNCHANGED, 0, words, 2).run(worker) for words in WORDS]
+    outcomes = [ChangedScene(scene, UNCHANGED, 0, words, 2).run(worker) for words in ("ours", "ours, other words")]
     asked = Instruction.parse(heard[0])
     assert heard[1] == paraphrase(2, asked.thing.color, asked.target.color) != heard[0]
     assert [one.reached for one in outcomes] == [True, False]
-    assert [row.method for row in change_rows(outcomes)] == ["ours", "ours", "ours, other words", "ours, other words"]
+    assert [row.method for row in change_rows(outcomes)] == ["ours"] * 2 + ["ours, other words"] * 2
 
 
 def test_every_paraphrase_is_a_wording_of_its_own_and_read_as_what_it_means() -> None:
@@ -128,7 +128,5 @@ def test_scenes_may_be_of_another_world() -> None:
     assert (
         observation["rgb"].shape == (32, 32, 3)
         and info["palette"]["robot"]
-        != worker.environment(plain).reset(seed=plain.seed, options=dict(plain.options))[1]["palette"][
-            "robot"
-        ]
+        != worker.environment(plain).reset(seed=plain.seed, options=dict(plain.options))[1]["palette"]["robot"]
     )

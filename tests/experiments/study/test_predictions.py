@@ -47,9 +47,7 @@ def test_everybody_imagines_the_scene_before_it_is_played(predicted) -> None:
         25,
         31,
     ]  # the double looks 24 frames ahead
-    assert (
-        truth.frames_THW3.shape == (31, 64, 64, 3) and (truth.frames_THW3[25:] == truth.frames_THW3[24]).all()
-    )
+    assert truth.frames_THW3.shape == (31, 64, 64, 3) and (truth.frames_THW3[25:] == truth.frames_THW3[24]).all()
     assert truth.text != truth.wrong_text
     ours, _, true, wrong, copy = (one.frames_T3HW for one in predictions)
     assert torch.equal(copy, truth.frames_T3HW[:1].expand_as(copy))
@@ -90,9 +88,7 @@ def test_scores_are_those_of_the_metrics(predicted) -> None:
 
 def test_equal_films_are_perfect_and_finite(predicted) -> None:
     truth, _ = predicted
-    found = (
-        Scorer(truth.frames_T3HW, MEASURES, upper=False).score(Prediction("true", truth.frames_T3HW)).curves
-    )
+    found = Scorer(truth.frames_T3HW, MEASURES, upper=False).score(Prediction("true", truth.frames_T3HW)).curves
     assert (found["psnr"] == PSNR_CAP).all() and (found["st_lpips"] == 0).all()
     assert found["ssim"] == pytest.approx(np.ones(30)) and set(found) == {"psnr", "ssim", "st_lpips"}
 
@@ -123,9 +119,7 @@ def test_a_clip_shows_everybody_above_their_masks(worker: Worker) -> None:
     ("badness", "count", "best", "worst"),
     [([3, 1, 5, 2, 4], 10, "bda", "ce"), ([3], 10, "a", ""), ([3, 1, 5, 2, 4], 1, "b", "c")],
 )
-def test_no_case_is_among_the_best_and_the_worst(
-    badness: list[float], count: int, best: str, worst: str
-) -> None:
+def test_no_case_is_among_the_best_and_the_worst(badness: list[float], count: int, best: str, worst: str) -> None:
     (scene,) = study_scenes("test", 1, 0)
     clips = [PredictionClip(scene, (), 0, "prediction", "abcde"[i]) for i in range(len(badness))]
     found = [(clip.caption, clip.place) for clip in extreme_clips(clips, badness, count)]

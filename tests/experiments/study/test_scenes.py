@@ -26,8 +26,7 @@ def test_scenes_of_different_seeds_differ_and_repeat() -> None:
 
 def test_columns_share_no_scene_but_for_their_variants() -> None:
     seeds = {
-        split: {s.seed for s in study_scenes(split, 100, 0)}
-        for split in {split for split, _ in LOOP_PLACES.values()}
+        split: {s.seed for s in study_scenes(split, 100, 0)} for split in {split for split, _ in LOOP_PLACES.values()}
     }
     assert sum(map(len, seeds.values())) == len(set().union(*seeds.values()))
 

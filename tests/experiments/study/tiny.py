@@ -85,8 +85,6 @@ def study(log: Path) -> Study:
         cases=cases,
         rows=rows,
         tables=[TABLE],
-        page=lambda run, results, found: [
-            Section("Again", f"{[v.round(6).tolist() for v in found['again']]}")
-        ],
+        page=lambda run, results, found: [Section("Again", f"{[v.round(6).tolist() for v in found['again']]}")],
         headline={"value": ("ours", "test", "all", "value")},
     )

@@ -44,18 +44,14 @@ def scene(frames: int = T, last: int = T - 2) -> dict[str, Any]:
     }
 
 
-def write(
-    folder: Path, count: int = 4, name: str = "train_explicit", codec: str = "mjpeg", **shape: int
-) -> Path:
+def write(folder: Path, count: int = 4, name: str = "train_explicit", codec: str = "mjpeg", **shape: int) -> Path:
     """A folder of the layout, with one list of the numbers 2, 10, 18, ...; returns the list."""
     for part in ("videos", "scenes"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     entries = {}
     for i in reversed(range(count)):  # the order of the numbers counts, not that of the file
         entries[str(2 + 8 * i)] = {"video": f"videos/CLEVR_new_{i:06}.avi", "caption": f" {CAPTION}"}
-        iio.imwrite(
-            folder / f"videos/CLEVR_new_{i:06}.avi", clip(i, **shape), plugin="FFMPEG", codec=codec, fps=24
-        )
+        iio.imwrite(folder / f"videos/CLEVR_new_{i:06}.avi", clip(i, **shape), plugin="FFMPEG", codec=codec, fps=24)
         (folder / f"scenes/CLEVR_new_{i:06}.json").write_text(json.dumps(scene(), indent=2))
     (folder / f"{name}.json").write_text(json.dumps(entries))
     return folder / f"{name}.json"
@@ -105,9 +101,7 @@ def test_where_the_list_lies(tmp_path: Path) -> None:
         assert CaterEpisodes.detect(path)
     write(tmp_path, 1, "test_explicit"), write(tmp_path, 1, "test_ambiguous")
     assert len(quietly(tmp_path / "test")) == len(quietly(tmp_path / "test_ambiguous.json")) == 1
-    with pytest.raises(
-        ValueError, match=r"has several lists of captions: say which, as .*/train_explicit\.json"
-    ):
+    with pytest.raises(ValueError, match=r"has several lists of captions: say which, as .*/train_explicit\.json"):
         open_episodes(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"there is no .*/val"):
         CaterEpisodes(tmp_path / "val")
@@ -212,11 +206,7 @@ def test_a_scene_that_ends_before_the_video(tmp_path: Path) -> None:
         (tmp_path / f"scenes/CLEVR_new_00000{i}.json").write_text(json.dumps(scene(frames)))
     positions = [quietly(source).episode(i).position for i in range(2)]
     assert [one.shape for one in positions] == [(T, 2, 3)] * 2
-    assert (
-        np.isnan(positions[0][-1]).all()
-        and np.isfinite(positions[0][:-1]).all()
-        and np.isfinite(positions[1]).all()
-    )
+    assert np.isnan(positions[0][-1]).all() and np.isfinite(positions[0][:-1]).all() and np.isfinite(positions[1]).all()
     objects, position, last = read_scene(tmp_path / "scenes/CLEVR_new_000001.json")
     assert (len(objects), position.shape, last) == (2, (T + 1, 2, 3), T - 2)
 
@@ -224,10 +214,7 @@ def test_a_scene_that_ends_before_the_video(tmp_path: Path) -> None:
 def test_an_episode_file_is_made_of_it_and_trains(tmp_path: Path, capsys) -> None:
     source, out = write(tmp_path, 4), tmp_path / "out/train.h5"
     (tmp_path / "videos/CLEVR_new_000001.avi").write_bytes(b"hello")
-    assert (
-        main(["data", "import", str(source), "--out", str(out), "--size", "32", "--crop", "--every", "2"])
-        == 0
-    )
+    assert main(["data", "import", str(source), "--out", str(out), "--size", "32", "--crop", "--every", "2"]) == 0
     said = capsys.readouterr()
     assert "frames of 64x48 become 32x32, cut off to fit" in said.err and "3 episodes, 18 frames" in said.out
     assert re.findall(r"left out: .*CLEVR_new_000001\.avi: it is no AVI file", said.err)

@@ -39,17 +39,13 @@ def test_an_episode_is_read_as_it_is(tmp_path: Path) -> None:
     file = write_episode(tmp_path / "a.npz")
     episodes = open_episodes(tmp_path)
     assert isinstance(episodes, CliportEpisodes) and len(open_episodes(file)) == 1
-    assert (
-        episodes.instructions == (CAPTION,) and episodes.lengths.tolist() == [5] and episodes.image_size == 16
-    )
+    assert episodes.instructions == (CAPTION,) and episodes.lengths.tolist() == [5] and episodes.image_size == 16
     with np.load(file) as stored:
         assert np.array_equal(episodes.frames(0), stored["frames"])
         truth = episodes.truth(0)
         assert truth is not None and np.array_equal(truth.segmentation, stored["segmentation"])
         whole = episodes.episode(0)
-        assert np.array_equal(whole.frames, stored["frames"]) and np.array_equal(
-            whole.position, stored["position"]
-        )
+        assert np.array_equal(whole.frames, stored["frames"]) and np.array_equal(whole.position, stored["position"])
     assert (whole.instruction, whole.objects, whole.questions) == (CAPTION, truth.objects, truth.questions)
     assert [(o.label, o.kind, o.color) for o in truth.objects][1] == (3, "block", "red")
     asked = {question.text: (question.moves, question.ends_at) for question in truth.questions}

@@ -33,9 +33,7 @@ def write_file(path: Path, lengths: tuple[int, ...] = LENGTHS, size: int = 64, v
     frames[..., 0] = np.repeat(np.arange(len(lengths)), lengths)[:, None, None]
     frames[..., 1] = np.concatenate([np.arange(length) for length in lengths])[:, None, None]
     with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "frames", data=frames, chunks=(4, size, size, 3), compression="gzip", compression_opts=1
-        )
+        file.create_dataset("frames", data=frames, chunks=(4, size, size, 3), compression="gzip", compression_opts=1)
         file.create_dataset("segmentation", data=frames[..., 1], chunks=(4, size, size))
         index = file.create_group("episode")
         index["start"] = np.cumsum(lengths) - lengths
@@ -49,9 +47,7 @@ def write_file(path: Path, lengths: tuple[int, ...] = LENGTHS, size: int = 64, v
             ("objects", [objects] * len(lengths)),
         ):
             index.create_dataset(name, data=np.array(texts, dtype=object), dtype=h5py.string_dtype())
-        file.attrs.update(
-            {"format": "textocvp-episodes", "format_version": version, "split": "val", "config": "{}"}
-        )
+        file.attrs.update({"format": "textocvp-episodes", "format_version": version, "split": "val", "config": "{}"})
     return path
 
 
@@ -90,8 +86,7 @@ def test_episodes_come_back_whole(path: Path) -> None:
 
 def test_both_versions_tell_the_same(tmp_path: Path) -> None:
     one, two = (
-        EpisodeFile(write_toy_episodes(tmp_path / f"{version}.h5", [4, 5], version=version))
-        for version in (1, 2)
+        EpisodeFile(write_toy_episodes(tmp_path / f"{version}.h5", [4, 5], version=version)) for version in (1, 2)
     )
     for old, new in zip(one, two, strict=True):
         assert old.objects == new.objects and old.robot == new.robot and old.questions == new.questions
@@ -106,9 +101,7 @@ def test_both_versions_tell_the_same(tmp_path: Path) -> None:
 def test_questions_swap_each_object_for_another_of_its_kind() -> None:
     objects = tuple(
         EpisodeObject(id, 2 + id, kind, color)
-        for id, (kind, color) in enumerate(
-            [("cup", "tan"), ("box", "red"), ("cup", "gray"), ("box", "dark red")]
-        )
+        for id, (kind, color) in enumerate([("cup", "tan"), ("box", "red"), ("cup", "gray"), ("box", "dark red")])
     )
     found = swapped_questions("move the red box to the gray cup", objects, 1, 2)
     assert found == (
@@ -128,9 +121,7 @@ def test_frames_and_sentences_are_enough(tmp_path: Path, version: int) -> None:
     with EpisodeFile(write_toy_episodes(tmp_path / "a.h5", [4, 5], version=version, truth=False)) as file:
         assert file.truth(0) is None and file.seeds is None and file.success is None
         episode = file.episode(1)
-        assert (
-            episode.frames.shape == (5, 32, 32, 3) and episode.segmentation is None and episode.seed is None
-        )
+        assert episode.frames.shape == (5, 32, 32, 3) and episode.segmentation is None and episode.seed is None
         assert set(file.vocabulary) <= set(" ".join(file.instructions).split())
         with EpisodeFile(write_toy_episodes(tmp_path / "b.h5", [4, 5], seed=1, truth=False)) as other:
             assert other.fingerprint != file.fingerprint
@@ -167,9 +158,7 @@ class _Squares(Episodes):
 def test_another_format_is_a_class_and_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tmp_path / "my.squares"
     source.write_text("one two\nthree four five\nsix")
-    with pytest.raises(
-        ValueError, match=r"not an episode file, nor of another format \(hdf5, cliport, cater\)"
-    ):
+    with pytest.raises(ValueError, match=r"not an episode file, nor of another format \(hdf5, cliport, cater\)"):
         open_episodes(source)
     monkeypatch.setitem(FORMATS, "squares", _Squares)
     with open_episodes(source, first=2) as file:
@@ -252,9 +241,7 @@ def test_wrong_files_are_refused(path: Path, tmp_path: Path, opened) -> None:
         file["x"] = 1
     with pytest.raises(ValueError, match="is an HDF5 file, but not an episode file"):
         opened(tmp_path / "other.h5")
-    with pytest.raises(
-        ValueError, match="format version 0, and this program reads versions 1 and 2; collect"
-    ):
+    with pytest.raises(ValueError, match="format version 0, and this program reads versions 1 and 2; collect"):
         opened(write_file(tmp_path / "old.h5", version=0))
     lost = write_file(tmp_path / "lost.h5")
     with h5py.File(lost, "a") as file:

@@ -79,8 +79,7 @@ def test_out_and_back_every_byte_is_the_same(file: Path, to: str, capsys) -> Non
 def test_episodes_without_actions_go_to_lerobot_alone(tmp_path: Path) -> None:
     needs("lerobot")
     bare = [
-        replace(e, action=None, reward=None, state=None, seed=None, success=None, primitives=())
-        for e in episodes()
+        replace(e, action=None, reward=None, state=None, seed=None, success=None, primitives=()) for e in episodes()
     ]
     write_episodes(tmp_path / "own.h5", bare)
     export(tmp_path / "own.h5", "lerobot", tmp_path / "set")
@@ -104,9 +103,7 @@ def test_minaris_own_library_opens_it(file: Path, monkeypatch: pytest.MonkeyPatc
         assert one.actions.tobytes() == wanted.action[:-1].tobytes()
         assert one.rewards.tobytes() == wanted.reward[:-1].tobytes()
         assert bool(one.terminations[-1]) == wanted.success != bool(one.truncations[-1])
-        assert found.observation_space.contains(
-            {name: values[0] for name, values in one.observations.items()}
-        )
+        assert found.observation_space.contains({name: values[0] for name, values in one.observations.items()})
         assert found.action_space.contains(one.actions[0])
 
 
@@ -153,18 +150,12 @@ def test_lerobots_older_layout_with_videos_is_read(tmp_path: Path) -> None:
     assert done.lines == ["this set: took the pictures of front, and not of the other cameras"]
     with EpisodeFile(tmp_path / "back.h5") as found:
         one = found.episode(0)
-        assert (
-            one.instruction == "lift it"
-            and one.action is not None
-            and one.action[:, 0].tolist() == list(range(T))
-        )
+        assert one.instruction == "lift it" and one.action is not None and one.action[:, 0].tolist() == list(range(T))
         assert np.abs(one.frames.astype(int) - frames).max() < 6, "lossy"
     with pytest.raises(OwnVideosError, match=r"it has no camera top; its cameras: front, side"):
         import_set(source, tmp_path / "other.h5", camera="top")
     (source / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["lift it"], "length": 9}\n')
-    with pytest.raises(
-        OwnVideosError, match=r"episode_000000\.parquet: 8 frames of episode 0, and 9 are listed"
-    ):
+    with pytest.raises(OwnVideosError, match=r"episode_000000\.parquet: 8 frames of episode 0, and 9 are listed"):
         import_set(source, tmp_path / "other.h5")
     info["codebase_version"] = "v1.6"
     (source / "meta/info.json").write_text(json.dumps(info))
@@ -207,9 +198,7 @@ def test_lerobots_present_layout_with_two_episodes_in_one_video_is_read(tmp_path
         both = np.concatenate([found.frames(0), found.frames(1)]).astype(int)
     assert np.abs(both - frames).max() < 6, "lossy, and no frame off by one"
     iio.imwrite(video, frames[:-1], plugin="FFMPEG", fps=fps)
-    with pytest.raises(
-        OwnVideosError, match=r"file-000\.mp4 ends before frame 12, to which its episodes reach"
-    ):
+    with pytest.raises(OwnVideosError, match=r"file-000\.mp4 ends before frame 12, to which its episodes reach"):
         import_set(source, tmp_path / "other.h5")
 
 
@@ -219,9 +208,7 @@ def test_damaged_sets_are_named_and_an_old_file_stays(file: Path, to: str) -> No
     out = file.parent / "own-v0"
     export(file, to, out)
     before = file.read_bytes()
-    for path in sorted(
-        p for p in out.rglob("*") if p.is_file() and p.name not in ("stats.json", "tasks.parquet")
-    ):
+    for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in ("stats.json", "tasks.parquet")):
         content = path.read_bytes()
         path.write_bytes(content[: len(content) // 2])
         with pytest.raises(OwnVideosError, match=str(out)):
@@ -235,9 +222,7 @@ def test_damaged_sets_are_named_and_an_old_file_stays(file: Path, to: str) -> No
 def test_what_is_not_allowed_is_said(file: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     with pytest.raises(OwnVideosError, match=r"--fps must be at least 1 frame a second, not 0"):
         export(file, "lerobot", file.parent / "set", fps=0)
-    with pytest.raises(
-        OwnVideosError, match=r"must end in the set's name, such as tabletop-v0, and not in 'set'"
-    ):
+    with pytest.raises(OwnVideosError, match=r"must end in the set's name, such as tabletop-v0, and not in 'set'"):
         export(file, "minari", file.parent / "set")
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     assert main(["data", "export", str(file), "--to", "lerobot", "--out", str(file.parent / "set")]) == 1
@@ -250,9 +235,7 @@ def test_what_is_not_allowed_is_said(file: Path, monkeypatch: pytest.MonkeyPatch
     assert f"there is no folder {file.parent / 'none'}" in capsys.readouterr().err
     assert sorted(p.name for p in file.parent.iterdir()) == ["own.h5", "rlds"]
     different = [*episodes(2), replace(episodes(1)[0], action=None)]
-    with pytest.raises(
-        OwnVideosError, match=r"episode 2 has no action, and the first has: all must be alike"
-    ):
+    with pytest.raises(OwnVideosError, match=r"episode 2 has no action, and the first has: all must be alike"):
         write_episodes(file.parent / "mixed.h5", different)
     assert not (file.parent / "mixed.h5").exists()
 

@@ -103,9 +103,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, w
     run = subprocess.run(
         [sys.executable, "-c", FULL_DISK, "data", *command], cwd=tmp_path, capture_output=True, text=True
     )
-    assert run.returncode == 1 and "File too large" in run.stderr and "Traceback" not in run.stderr, (
-        run.stderr
-    )
+    assert run.returncode == 1 and "File too large" in run.stderr and "Traceback" not in run.stderr, run.stderr
     assert sorted(one.name for one in tmp_path.iterdir()) == before
     assert not out.is_file() or out.read_text() == "old"
 
@@ -160,9 +158,7 @@ def test_what_cannot_be_used_is_named_and_nothing_half_written_stays(tmp_path: P
     assert "6 frames; the predictor looks 3 ahead" in problems(open_episodes(out), window=3)[0]
     before = out.read_bytes()
     captions.write_text("broken.mp4,put it there\n")
-    with pytest.raises(
-        OwnVideosError, match=r"no video of .* can be used: 0000: the captions have no sentence"
-    ):
+    with pytest.raises(OwnVideosError, match=r"no video of .* can be used: 0000: the captions have no sentence"):
         import_videos(folder, out)
     assert out.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["own.h5", "videos"]
     captions.unlink()
@@ -242,13 +238,9 @@ def test_a_video_that_was_cut_short_is_named(tmp_path: Path, ending: str) -> Non
     assert done.episodes == 1 and done.frames < 36
     (said,) = (line for line in done.lines if "cut short" in line)
     if ending == ".mkv":  # its header says how long it is
-        assert (
-            said == f"a.mkv: cut short: {done.frames} of the 40 frames that its header promises can be read"
-        )
+        assert said == f"a.mkv: cut short: {done.frames} of the 40 frames that its header promises can be read"
     else:
-        assert said.startswith(
-            f"a.avi: damaged or cut short: {done.frames} frames can be read, and the decoder"
-        )
+        assert said.startswith(f"a.avi: damaged or cut short: {done.frames} frames can be read, and the decoder")
 
 
 def test_a_contact_sheet_has_the_sentences(tmp_path: Path) -> None:

@@ -24,9 +24,7 @@ def test_a_ratio_of_rates_is_as_sure_as_they_are():
     # 8 of 8 twice: nothing was lost, but each rate may be as low as .676, and so the ratio 1.48 either way.
     all_of_8 = wilson_interval(8, 8)
     found = ratio_interval(all_of_8, all_of_8)
-    assert (found.value, found.low, found.high, found.n) == pytest.approx(
-        (1, all_of_8.low, 1 / all_of_8.low, 8)
-    )
+    assert (found.value, found.low, found.high, found.n) == pytest.approx((1, all_of_8.low, 1 / all_of_8.low, 8))
     # For many trials it is the textbook's interval on the logarithm (Katz 1978).
     p, q, n = 0.6, 0.8, 4000
     found = ratio_interval(wilson_interval(int(p * n), n), wilson_interval(int(q * n), n))

@@ -41,9 +41,7 @@ def test_ari_agrees_with_counting_pairs_and_ignores_the_background(seed, slots, 
     inside = truth > 0
     if inside.sum() < 2:
         return
-    assert foreground_ari(labels, truth) == pytest.approx(
-        ari_by_counting_pairs(labels[inside], truth[inside])
-    )
+    assert foreground_ari(labels, truth) == pytest.approx(ari_by_counting_pairs(labels[inside], truth[inside]))
     changed = np.where(inside, labels, rng.integers(slots, size=(5, 6)))
     assert foreground_ari(changed, truth) == foreground_ari(labels, truth)
 

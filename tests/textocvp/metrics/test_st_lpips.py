@@ -88,7 +88,5 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
 
 def test_without_the_package_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
-    with pytest.raises(
-        MetricUnavailable, match=r"ST-LPIPS cannot be computed: .*pip install stlpips_pytorch"
-    ):
+    with pytest.raises(MetricUnavailable, match=r"ST-LPIPS cannot be computed: .*pip install stlpips_pytorch"):
         load_st_lpips()

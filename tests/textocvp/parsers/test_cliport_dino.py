@@ -220,9 +220,7 @@ def test_both_stages_and_a_rollout(stage_one: Arguments, weights: Path, tmp_path
     assert rollout.frames.shape == (1, 4, 3, 32, 32) and rollout.masks.shape == (1, 4, 4, 32, 32)
     torch.testing.assert_close(rollout.masks.sum(2), torch.ones(1, 4, 32, 32))
     assert world.rollout(image, text, horizon=3).slots.equal(rollout.slots)
-    old, new = (
-        TextOCVP.from_pretrained(path).renderer.state_dict() for path in (folder, second.out / "checkpoint")
-    )
+    old, new = (TextOCVP.from_pretrained(path).renderer.state_dict() for path in (folder, second.out / "checkpoint"))
     assert all(torch.equal(old[name], new[name]) for name in old)
 
     # Elsewhere the weights lie elsewhere; but they must be the same.
@@ -267,9 +265,7 @@ def test_encoding_goes_on_where_it_was_killed_and_refuses_what_is_not_its_own(
     with pytest.raises(CacheError, match="damaged"):
         train_parser.train(dataclasses.replace(args, steps=3))
     with pytest.raises(SettingsError, match="cache_features needs a frozen image encoder"):
-        train_parser.train(
-            stage_one("conv", "parser.image_size=32", preset="savi-small", cache_features=True)
-        )
+        train_parser.train(stage_one("conv", "parser.image_size=32", preset="savi-small", cache_features=True))
     with pytest.raises(SettingsError, match=r"train\.h5 has frames of 32 pixels, parser\.image_size is 64"):
         train_parser.train(stage_one("other", preset="savi-small"))
     nowhere = f"parser.encoder_weights={tmp_path / 'nowhere'}"

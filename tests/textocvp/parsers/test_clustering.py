@@ -63,9 +63,7 @@ def test_the_largest_regions_win_when_slots_are_few() -> None:
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_regions_do_not_depend_on_the_order_of_the_color_channels(order: tuple[int, ...]) -> None:
     frame = paint(*SCENE)
-    assert torch.equal(
-        ClusterInitializer()(frame, 8).masks, ClusterInitializer()(frame[:, list(order)], 8).masks
-    )
+    assert torch.equal(ClusterInitializer()(frame, 8).masks, ClusterInitializer()(frame[:, list(order)], 8).masks)
 
 
 def test_shading_moves_color_features_less_than_another_color_does() -> None:

@@ -55,9 +55,7 @@ def test_features_are_the_last_layers_patches_row_by_row(folder: Path, images: n
     with torch.no_grad():
         rows = projection(normalized(frames)).flatten(2).transpose(1, 2)
     assert rows.shape[1] == found.shape[1]
-    assert torch.equal(
-        rows[:, 6], projection(normalized(frames))[:, :, 1, 0]
-    )  # patch 6 starts the second row
+    assert torch.equal(rows[:, 6], projection(normalized(frames))[:, :, 1, 0])  # patch 6 starts the second row
 
 
 def test_it_is_frozen_and_in_evaluation_mode_whatever_is_said(folder: Path, images: np.ndarray) -> None:
@@ -84,9 +82,7 @@ def test_weights_are_known_by_their_fingerprint(folder: Path, tmp_path: Path, im
         encoder(other, fingerprint=first.fingerprint)(frames)
 
 
-def test_a_checkpoint_of_a_whole_classifier_in_half_precision_is_read(
-    folder: Path, images: np.ndarray
-) -> None:
+def test_a_checkpoint_of_a_whole_classifier_in_half_precision_is_read(folder: Path, images: np.ndarray) -> None:
     frames, before = to_frames(images[None])[0], encoder(folder)(to_frames(images[None])[0])
     tensors = load((folder / "model.safetensors").read_bytes())
     whole = {f"dinov2.{name}": tensor.half() for name, tensor in tensors.items()}

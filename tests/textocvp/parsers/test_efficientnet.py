@@ -107,9 +107,7 @@ def training(folder: Path, out: str, **changes: object) -> ParserTraining:
     return ParserTraining(folder / "train.h5", folder / "val.h5", folder / out, **options)  # type: ignore[arg-type]
 
 
-def test_cached_is_uncached_bit_for_bit(
-    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cached_is_uncached_bit_for_bit(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_toy_episodes(tmp_path / "train.h5", [6, 5, 4])
     write_toy_episodes(tmp_path / "val.h5", [6, 5], seed=1)
     monkeypatch.setitem(PRESETS, TINY.name, TINY)
@@ -121,9 +119,7 @@ def test_cached_is_uncached_bit_for_bit(
             cached_features(encoder(dim=8, patch=8), episodes, tmp_path / "cache")
     for out, cached in (("cached", True), ("online", False)):
         train_parser.train(training(tmp_path, out, cache_features=cached))
-    one, other = (
-        TextOCVP.from_pretrained(tmp_path / out / "checkpoint").state_dict() for out in ("cached", "online")
-    )
+    one, other = (TextOCVP.from_pretrained(tmp_path / out / "checkpoint").state_dict() for out in ("cached", "online"))
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
     assert not any("frozen" in name or "backbone" in name for name in one)
 
@@ -146,9 +142,7 @@ def test_both_stages_by_the_repositorys_own_commands(
     assert rollout.frames.shape == (1, 4, 3, 32, 32) and rollout.masks.shape == (1, 4, 4, 32, 32)
 
 
-def test_what_is_missing_or_wrong_is_named(
-    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_missing_or_wrong_is_named(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = encoder()
     first(frames())
     other = write_tiny_lite0(tmp_path / "other.pth", seed=1)
@@ -169,9 +163,7 @@ def test_what_is_missing_or_wrong_is_named(
     with pytest.raises(WeightsError, match=r"lite0\.pth is missing"):
         encoder().load()
     monkeypatch.setitem(sys.modules, "efficientnet_lite_pytorch", None)  # as where it is not installed
-    with pytest.raises(
-        WeightsError, match=r"parser\.encoder=efficientnet-lite0 .*'textocvp\[efficientnet\]'"
-    ):
+    with pytest.raises(WeightsError, match=r"parser\.encoder=efficientnet-lite0 .*'textocvp\[efficientnet\]'"):
         encoder().load()
     # A model can be built and counted without it all.
     assert sum(p.numel() for p in TextOCVP(replace(TINY, name="x")).parser.parameters()) > 0

@@ -17,9 +17,7 @@ def clip(frames: int = 5, step: int = 4) -> torch.Tensor:
     """(1, T, 3, 64, 64): a red box that moves right by `step` pixels a frame and passes below a blue one."""
     video = torch.tensor(DARK, dtype=torch.float32)[:, None, None].expand(frames, 3, 64, 64).clone()
     for t in range(frames):
-        video[t, :, 12:20, 10 + step * t : 18 + step * t] = torch.tensor(RED, dtype=torch.float32)[
-            :, None, None
-        ]
+        video[t, :, 12:20, 10 + step * t : 18 + step * t] = torch.tensor(RED, dtype=torch.float32)[:, None, None]
         video[t, :, 30:46, 20:40] = torch.tensor(BLUE, dtype=torch.float32)[:, None, None]
     return video[None] / 127.5 - 1
 

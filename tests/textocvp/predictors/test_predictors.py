@@ -107,9 +107,7 @@ def test_window_frames_see_each_other_but_nothing_older_than_the_window(kind):
     changed = slots.clone()
     changed[:, :2, :, : EXPLICIT.content] += 1.0  # older than the window of the first step
     with torch.no_grad():
-        assert torch.equal(
-            model.rollout(slots, text(), 1).slots_BSKD, model.rollout(changed, text(), 1).slots_BSKD
-        )
+        assert torch.equal(model.rollout(slots, text(), 1).slots_BSKD, model.rollout(changed, text(), 1).slots_BSKD)
         model.rollout(slots, text(), 10)  # goes on for ever
         changed[:, 2, :, : EXPLICIT.content] += 1.0
         assert (

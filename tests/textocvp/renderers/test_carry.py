@@ -239,9 +239,7 @@ def test_other_renderers_draw_at_their_own_size(scene: np.ndarray, picture: np.n
     large, small = (world_model.rollout(x, TEXT, horizon=3) for x in (picture, scene))
     assert large.image_size == (32, 32) and large.seen is None
     assert torch.equal(large.slots, small.slots) and torch.equal(large.frames, small.frames)
-    with pytest.raises(
-        ValueError, match="made by another model"
-    ):  # of twice the size, and without a first frame
+    with pytest.raises(ValueError, match="made by another model"):  # of twice the size, and without a first frame
         world_model.rollout(replace(small, image_size=(64, 64)), TEXT, horizon=1)
 
 

@@ -115,9 +115,7 @@ def test_order_is_learned() -> None:
 
 def test_a_world_model_remembers_at_its_own_size() -> None:
     model = WorldModel(build(RECALL))
-    first = torch.randint(
-        0, 256, (64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    ).numpy()
+    first = torch.randint(0, 256, (64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
     rollout = model.rollout(first, ["put the red block in the blue bowl"], horizon=2)
     assert rollout.image_size == (32, 32)
     assert rollout.frames.shape == (1, 3, 3, 32, 32)

@@ -47,9 +47,7 @@ def frozen(encoder: PretrainedEncoder, texts: list[str]) -> torch.Tensor:
 
 def test_the_package_holds_the_published_weights():
     """It is somebody else's package: the file must be the one of sentence-transformers/all-MiniLM-L6-v2."""
-    found = hashlib.sha256(
-        (PretrainedTextConfig(kind="minilm").weights_folder() / "model.safetensors").read_bytes()
-    )
+    found = hashlib.sha256((PretrainedTextConfig(kind="minilm").weights_folder() / "model.safetensors").read_bytes())
     assert found.hexdigest() == "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 
 
@@ -59,9 +57,7 @@ def test_states_are_those_of_the_sentence_model(encoder):
     def pooled(text):
         return torch.nn.functional.normalize(frozen(encoder, [text])[0].mean(dim=0), dim=0)
 
-    cat, feline, market = map(
-        pooled, ["The cat sleeps.", "A feline is asleep.", "Stock markets fell sharply."]
-    )
+    cat, feline, market = map(pooled, ["The cat sleeps.", "A feline is asleep.", "Stock markets fell sharply."])
     assert cat @ feline > 0.6 and cat @ market < 0.2
     assert encoder.words("Put the zorble!") == ["[CLS]", "put", "the", "z", "##or", "##ble", "!", "[SEP]"]
 

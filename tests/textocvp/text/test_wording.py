@@ -64,9 +64,7 @@ def test_what_stands_on_something_is_no_bowl(shipped: WorldModel) -> None:
         assert shipped.reads(text) == on
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in bundled_checkpoints() if name not in ("mage-small", "cater")]
-)
+@pytest.mark.parametrize("name", [name for name in bundled_checkpoints() if name not in ("mage-small", "cater")])
 def test_sentences_of_the_captions_stay_as_they_are(name: str) -> None:
     """The rules change no embedding of a plain sentence, to the last bit."""
     encoder = WorldModel.from_pretrained(name).model.text
@@ -87,9 +85,7 @@ def test_sentences_of_the_captions_stay_as_they_are(name: str) -> None:
         "put nothing in the blue bowl",
     ],
 )
-def test_a_negation_is_refused_with_its_text(
-    placed_world_model: WorldModel, scene: np.ndarray, text: str
-) -> None:
+def test_a_negation_is_refused_with_its_text(placed_world_model: WorldModel, scene: np.ndarray, text: str) -> None:
     with pytest.raises(ValueError, match="never met: it would imagine what is not to be") as refused:
         placed_world_model.rollout(scene, [PLAIN, text], horizon=1)
     assert repr(text) in str(refused.value)
@@ -108,13 +104,9 @@ def test_an_order_that_no_caption_has_is_a_warning(shipped: WorldModel) -> None:
         assert repr(text) in str(caught[0].message)
 
 
-def test_another_script_is_named(
-    shipped: WorldModel, placed_world_model: WorldModel, scene: np.ndarray
-) -> None:
+def test_another_script_is_named(shipped: WorldModel, placed_world_model: WorldModel, scene: np.ndarray) -> None:
     text = "\N{CYRILLIC SMALL LETTER YA}"
-    with pytest.raises(
-        ValueError, match="at least one word that the model knows, got '\N{CYRILLIC SMALL LETTER YA}'"
-    ):
+    with pytest.raises(ValueError, match="at least one word that the model knows, got '\N{CYRILLIC SMALL LETTER YA}'"):
         placed_world_model.rollout(scene, text)
     with pytest.warns(UserWarning, match=f"never met '{text}'"):
         assert shipped.reads(f"{PLAIN} {text}") == PLAIN
@@ -146,17 +138,13 @@ def test_what_is_no_rule_is_refused(rule: str) -> None:
 
 def test_forms_are_learned_from_captions_and_foreign_rules_dropped() -> None:
     config = WordsConfig(vocabulary=TABLETOP_WORDS, rewrites=TABLETOP_REWRITES)
-    own = config.for_captions(
-        [PLAIN, "put the gray block in the white bowl", "put the cyan block on the red block"]
-    )
+    own = config.for_captions([PLAIN, "put the gray block in the white bowl", "put the cyan block on the red block"])
     assert set(own.forms) == {"put the {} block in the {} bowl", "put the {} block on the {} block"}
     assert own.rewrites == TABLETOP_REWRITES and "on" not in own.untrained
     later = own.met(["put the red block with the green block"])
     assert later.forms == (*own.forms, "put the {} block with the {} block")
     assert set(own.untrained) - set(later.untrained) == {"with"}
-    others = config.for_captions(
-        ["place the cube on a dish"]
-    )  # these rules would make other words of its words
+    others = config.for_captions(["place the cube on a dish"])  # these rules would make other words of its words
     assert others.rewrites == () and others.tokens("place the cube on a dish") == [
         "place",
         "the",

@@ -18,9 +18,7 @@ WORDS = {"lexicon": TABLETOP_WORDS, "transformer": TABLETOP_WORDS + TABLETOP_COL
 
 def encoder(kind: str, **changes: object) -> TextEncoder:
     torch.manual_seed(0)
-    return build_text_encoder(
-        WordsConfig(kind, 32, hidden=64, **{"vocabulary": WORDS[kind], **changes})
-    ).eval()
+    return build_text_encoder(WordsConfig(kind, 32, hidden=64, **{"vocabulary": WORDS[kind], **changes})).eval()
 
 
 @pytest.mark.parametrize("kind", ["transformer", "lexicon"])
@@ -76,9 +74,7 @@ def test_the_vocabulary_is_in_the_configuration():
 
 
 def test_new_captions_bring_new_words_and_old_ones_keep_their_rows():
-    lexicon = WordsConfig(vocabulary=("the", "in", "red")).for_captions(
-        ["Stack the red block on the light block"]
-    )
+    lexicon = WordsConfig(vocabulary=("the", "in", "red")).for_captions(["Stack the red block on the light block"])
     assert lexicon.vocabulary == (
         "the",
         "in",

@@ -67,9 +67,7 @@ BLUE, GREEN = Question("put it in the blue bowl", 7, 8), Question("put it in the
 def test_trials_ask_and_judge() -> None:
     slots = true_slots(6)[:1]
     trials = asked([BLUE, GREEN], {7: 1, 8: 2, 9: 3})
-    assert trials.original == [Trial(0, BLUE.text, 1, 2)] and trials.other_target == [
-        Trial(0, GREEN.text, 1, 3)
-    ]
+    assert trials.original == [Trial(0, BLUE.text, 1, 2)] and trials.other_target == [Trial(0, GREEN.text, 1, 3)]
     assert trials.wrong_text == [Trial(0, GREEN.text, 1, 2)]
     held, model = held_out(slots, trials), _Obedient({BLUE.text: (1, 2), GREEN.text: (1, 3)})
     obedient = held.measure(model)

@@ -49,9 +49,7 @@ def test_loss_counts_each_field_in_its_own_unit():
     assert sum(vars(slot_loss(slots, slots, weight, LAYOUT, std)).values()) == 0
     state = SlotState.split(slots, LAYOUT)
     shifted = replace(state, position=state.position + torch.tensor([0.3, 0.0]))
-    assert slot_loss(shifted.join(), slots, weight, LAYOUT, std).position.item() == pytest.approx(
-        9.5, abs=0.01
-    )
+    assert slot_loss(shifted.join(), slots, weight, LAYOUT, std).position.item() == pytest.approx(9.5, abs=0.01)
     wider = replace(state, scale=state.scale * np.exp([0.1, 0.0], dtype=np.float32))
     assert slot_loss(wider.join(), slots, weight, LAYOUT, std).scale.item() == pytest.approx(1.0, abs=0.01)
     other = replace(state, content=state.content + torch.tensor([0.0, 2.0, 0.0, 0.0]))

@@ -27,9 +27,7 @@ from textocvp.world_model import WorldModel
 OCVP_SEQ = replace(
     PLACED,
     name="tiny-ocvp-seq",
-    predictor=PredictorConfig(
-        kind="ocvp-seq", dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8
-    ),
+    predictor=PredictorConfig(kind="ocvp-seq", dim=16, layers=2, heads=2, hidden=16, attention="causal", window=8),
 )
 
 
@@ -73,9 +71,7 @@ def test_a_checkpoint_knows_how_far_it_was_trained(folder: Path) -> None:
 
 
 def test_episodes_longer_than_the_window_are_not_cut_without_a_word(folder: Path) -> None:
-    with pytest.warns(
-        UserWarning, match=r"nothing is learned after frame 5, the longest has \d+; --set predictor"
-    ):
+    with pytest.warns(UserWarning, match=r"nothing is learned after frame 5, the longest has \d+; --set predictor"):
         train(run(folder, PLACED, "short", steps=1, set=("predictor.window=4",)))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)

@@ -88,9 +88,7 @@ def test_workers_read_the_steps_in_their_order(folder: Path) -> None:
 def test_workers_outlive_the_signal_that_ends_a_run(folder: Path) -> None:
     """A cluster sends it to whole process groups, and without workers the last update could not be finished."""
     args = parser_run(folder, "out")
-    before = set(
-        multiprocessing.active_children()
-    )  # what other tests left running is none of this one's business
+    before = set(multiprocessing.active_children())  # what other tests left running is none of this one's business
     with EpisodeFile(args.data) as episodes:
         batches = iter(prefetch(ClipReader(episodes, args, slice(None)), range(40), 1))
         next(batches)
@@ -171,9 +169,7 @@ def test_a_run_does_not_write_over_what_it_begins_with(folder: Path) -> None:
     checkpoint = folder / "begun/checkpoint"
     before = (checkpoint / "model.safetensors").read_bytes()
     for begin in (partial(predictor_run, parser=checkpoint), partial(parser_run, start=checkpoint)):
-        with pytest.raises(
-            SettingsError, match=r"begun/checkpoint lies in --out .*begun, which this run writes"
-        ):
+        with pytest.raises(SettingsError, match=r"begun/checkpoint lies in --out .*begun, which this run writes"):
             begin(folder, "begun", fresh=True)
     assert (checkpoint / "model.safetensors").read_bytes() == before
 
@@ -183,9 +179,7 @@ def test_a_run_with_other_settings_is_not_taken_for_the_same(folder: Path) -> No
     run = predictor_run(folder, "settings", steps=2)
     train(run)
     before = weights(run.out)
-    with pytest.raises(
-        SettingsError, match=r"holds a run with moving 20\.0, not 5\.0: give the same settings"
-    ):
+    with pytest.raises(SettingsError, match=r"holds a run with moving 20\.0, not 5\.0: give the same settings"):
         train(replace(run, steps=3, moving=5.0))
     assert all(torch.equal(tensor, before[name]) for name, tensor in weights(run.out).items())
     train(replace(run, steps=3))
@@ -202,9 +196,7 @@ def test_settings_without_sense_are_refused_before_anything_is_written(folder: P
     assert not (folder / "senseless").exists()
 
 
-def test_a_run_that_diverges_ends_and_keeps_its_last_good_state(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_diverges_ends_and_keeps_its_last_good_state(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = predictor_run(folder, "diverging", steps=2)
     train(run)
     before = {path: path.read_bytes() for path in (run.out / "checkpoint").iterdir()}
