@@ -10,7 +10,6 @@ from experiments.study.pictures import (
     CHANGES,
     UNCHANGED,
     WOOD,
-    WORDS,
     ChangedScene,
     change_picture,
     change_rows,
