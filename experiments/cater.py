@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Line, Paper, TableSpec
 from experiments.study.any_size import Seen, drawn, film, imagine, mask_curves
 from experiments.study.attention import glow
-from experiments.study.cater import CaterScene, Judged, cater_scenes, judge
+from experiments.study.cater import CaterScene, Judged, cater_scenes, judge, slots_of_things
 from experiments.study.clips import extreme_clips
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import Model, lines
@@ -39,7 +39,6 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from textocvp.data.episodes import Episode, EpisodeObject
-from textocvp.metrics import object_ious
 from textocvp.slots import SlotState
 
 SPLIT = "test"
@@ -172,7 +171,7 @@ def follows(model: Any, clip: Actions, truth: Episode, seed: int) -> float | Non
     rest = [thing for k, thing in enumerate(clip.things) if k not in (act.thing, act.into)]
     acts = draw_acts(np.random.default_rng([len(rest), 6]), (cone, *rest), first=(0, "slide"))
     first = model.rollout(truth.frames[0], [clip.instruction], horizon=len(truth.frames) - 1, seed=seed)
-    slots = _slots(first, truth)
+    slots = slots_of_things(first, cast(np.ndarray, truth.segmentation)[0])
     if acts is None or act.thing not in slots or act.into not in slots:
         return None
     after = Actions((cone, *rest), acts)
@@ -180,14 +179,6 @@ def follows(model: Any, clip: Actions, truth: Episode, seed: int) -> float | Non
     cone_T2, inside_T2 = went[:, slots[act.thing]], went[:, slots[act.into]]
     moved = float((cone_T2[-1] - cone_T2[0]).norm()) > FOLLOWED
     return float(moved and float((cone_T2[-1] - inside_T2[-1]).norm()) <= FOLLOWED)
-
-
-def _slots(rollout: Any, truth: Episode) -> dict[int, int]:
-    """Thing -> slot, by the masks of the first frame."""
-    labels_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
-    found = object_ious(labels_HW, truth.segmentation[0], [o.label for o in truth.objects], min_pixels=1)  # type: ignore[index]
-    pairs = zip(found.ids, found.slots, found.ious, strict=True)
-    return {int(label) - 1: int(slot) for label, slot, iou in pairs if iou > 0.3}
 
 
 @dataclass(frozen=True)

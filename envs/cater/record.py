@@ -55,8 +55,7 @@ class CaterConfig:
         for number in numbers:
             seed = SPLITS[self.split].seed(number)
             clip, jitter = clip_of(seed)
-            table.build(clip, jitter)
-            drawn = [table.render(frame) for frame in range(FRAMES)]
+            frames, labels = table.film(clip, jitter)
             poses = [clip.poses(frame) for frame in range(FRAMES)]
             said = clip.instruction
             if self.captions == "ambiguous":
@@ -66,8 +65,8 @@ class CaterConfig:
                 said,
                 clip,
                 {
-                    "frames": np.stack([frame for frame, _ in drawn]),
-                    "segmentation": np.stack([labels for _, labels in drawn]),
+                    "frames": frames,
+                    "segmentation": labels,
                     "object_position": np.stack([centers for centers, _ in poses]).astype(np.float32),
                     "object_orientation": np.stack([turns for _, turns in poses]).astype(np.float32),
                 },

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFilter
 from ..physics.camera import Camera, CameraPreset
 from ..physics.shapes import Mesh
 from ..physics.simulation import Bullet
-from .scenes import EYE, Clip, Thing
+from .scenes import EYE, FRAMES, Clip, Thing
 
 CAMERA = CameraPreset(eye=EYE, target=(0.0, 0.0, 0.2), fov=42.0, near=5.0, far=40.0)
 OVERSAMPLING = 2  # pixels of a frame average so many drawn ones along each axis
@@ -43,6 +43,12 @@ class Table:
             self.bullet.removeBody(body)
         self.clip, self.bodies = clip, [self._add(thing) for thing in clip.things]
         self.light = np.array(LIGHT) + jitter
+
+    def film(self, clip: Clip, jitter: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """All frames of a clip (T, H, W, 3), and their labels (T, H, W); see `build` and `render`."""
+        self.build(clip, jitter)
+        frames, labels = zip(*map(self.render, range(FRAMES)), strict=True)
+        return np.stack(frames), np.stack(labels)
 
     def render(self, frame: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """The clip at a frame (H, W, 3), and its labels (H, W): 0 the floor, 1 + i thing i."""
@@ -146,15 +152,7 @@ def _outline(shape: str) -> NDArray[np.float64]:
 def _rotated(points: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (N, 3) turned by a quaternion x y z w."""
     # Not with `np.cross`, which takes longer than drawing.
-    x, y, z, w = turn
-    matrix = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    rotated: NDArray[np.float64] = points @ matrix.T
+    rotated: NDArray[np.float64] = points @ np.reshape(p.getMatrixFromQuaternion(turn.tolist()), (3, 3)).T
     return rotated
 
 

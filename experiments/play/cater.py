@@ -12,15 +12,13 @@ from envs.cater.record import clip_of
 from envs.cater.scenes import FRAMES
 from envs.splits import SEEDS_PER_SPLIT, SPLITS
 from experiments.play.links import Link, Refused
-from experiments.study.cater import CaterScene
+from experiments.study.cater import CaterScene, slots_of_things
 from planning import PinholeCamera
 from textocvp import Rollout
 from textocvp.film_page import slot_names
-from textocvp.metrics import object_ious
 
 SPLIT = "test"  # scenes that no model was trained on
 CAPTIONS = 8  # that are proposed of a scene
-OVERLAP = 0.3  # of a slot with a thing that gives it its name
 
 
 class Cater:
@@ -77,10 +75,7 @@ class Cater:
         numbered = slot_names(rollout)
         if own_picture:
             return numbered
-        labels_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
-        found = object_ious(labels_HW, self.labels, range(1, 1 + len(self.called)), min_pixels=1)
-        matched = zip(found.ids, found.slots, found.ious, strict=True)
-        named = {int(slot): self.called[int(label) - 1] for label, slot, iou in matched if iou > OVERLAP}
+        named = {slot: self.called[thing] for thing, slot in slots_of_things(rollout, self.labels).items()}
         return {slot: name for slot, name in numbered.items() if name == "table"} | named
 
     def read(self, text: str) -> Clip:
@@ -91,5 +86,4 @@ class Cater:
 
     def act(self, wish: Clip, rollout: Rollout) -> np.ndarray:
         """The frames of the clip; then the scene stands as before."""
-        self.table.build(wish, self.jitter)
-        return np.stack([self.table.render(frame)[0] for frame in range(FRAMES)])
+        return self.table.film(wish, self.jitter)[0]

@@ -9,16 +9,18 @@ import numpy as np
 
 from envs.cater import Act, Action, Clip, Table, Thing, cell, draw_acts
 from envs.cater.record import clip_of
-from envs.cater.scenes import CONTAINED, FRAMES, LIFT
+from envs.cater.scenes import CONTAINED, LIFT
 from envs.splits import SPLITS
 from experiments.study.scenes import SCENES_PER_SEED
 from planning import PinholeCamera
+from textocvp import Rollout
 from textocvp.metrics import object_ious
 
 MOVED = 3.0  # pixels of 64: a thing that stays nearer to its place has not moved
 LIFTED = 0.5  # share of the way up at which a thing counts as lifted
 NEAR = 4.0  # pixels between a cone and what it was put over
 VANISHED = 0.4  # share of its pixels that a contained thing shows at most
+COVERED = 0.3  # IoU of a slot with the thing that it holds, at least
 TRIES = 20  # to find other actions for a scene
 
 
@@ -37,10 +39,7 @@ class CaterScene:
 
     def watch(self, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames (T, H, W, 3) uint8 and labels (T, H, W), 1 + i for thing i, as the simulator draws them."""
-        table, clip = _table(size), self.clip()
-        table.build(clip, clip_of(self.seed)[1])
-        frames, labels = zip(*(table.render(frame) for frame in range(FRAMES)), strict=True)
-        return np.stack(frames), np.stack(labels)
+        return _table(size).film(self.clip(), clip_of(self.seed)[1])
 
 
 @lru_cache(maxsize=2)
@@ -64,6 +63,14 @@ def cater_scenes(count: int, seed: int, split: str = "test") -> list[CaterScene]
     """So many scenes of a split; each `seed` chooses other ones."""
     first = SCENES_PER_SEED * seed
     return [CaterScene(split, SPLITS[split].seed(first + i)) for i in range(count)]
+
+
+def slots_of_things(rollout: Rollout, first_HW: np.ndarray) -> dict[int, int]:
+    """Thing -> the slot (B = 1) whose mask covers it in the first frame, by the simulator's labels of that frame."""
+    labels_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
+    found = object_ious(labels_HW, first_HW, np.unique(first_HW[first_HW > 0]).tolist(), min_pixels=1)
+    pairs = zip(found.ids, found.slots, found.ious, strict=True)
+    return {int(label) - 1: int(slot) for label, slot, iou in pairs if iou > COVERED}
 
 
 @dataclass(frozen=True)
