@@ -90,15 +90,15 @@ def collected(out: Path) -> int:
 
 def collected_digest(out: Path) -> str:
     """Of every value and attribute of the file."""
-    digest = hashlib.sha256()
+    values: dict[str, object] = {"left": sorted(one.name for one in out.iterdir())}
     with h5py.File(out / "x.h5", "r") as file:
-        values = {name: file[name][:] for name in ("frames", "segmentation", "object_position", "action")}
-        values |= {f"episode/{name}": rows[:] for name, rows in file["episode"].items()}
-        for name, value in sorted((values | dict(file.attrs)).items()):
-            digest.update(repr((name, value.tolist() if isinstance(value, np.ndarray) else value)).encode())
-    left = sorted(one.name for one in out.iterdir())
-    digest.update(repr(left).encode())
-    return digest.hexdigest()
+        for name, value in file.attrs.items():
+            values[f"attribute {name}"] = np.asarray(value).tolist()
+        for name in [*file, *(f"episode/{column}" for column in file["episode"])]:
+            if isinstance(file[name], h5py.Dataset):
+                rows = file[name][:]  # texts are objects, whose bytes are addresses
+                values[name] = rows.tolist() if rows.dtype == object else rows.tobytes()
+    return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
 
 
 def trained(out: Path) -> int:
@@ -109,12 +109,12 @@ def trained(out: Path) -> int:
 
 
 def trained_digest(out: Path) -> str:
-    """Of every tensor of the checkpoint, and of the held-out figures."""
+    """Of every tensor of the checkpoint, and of the held-out figures and the settings."""
     digest = hashlib.sha256()
     for name, tensor in sorted(load_file(out / "checkpoint/model.safetensors").items()):
         digest.update(name.encode() + tensor.tobytes())
-    for path in sorted(out.glob("*metrics*.json")):
-        digest.update(path.read_bytes())
+    for path in sorted(out.glob("*.json")):  # figures, settings
+        digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
 

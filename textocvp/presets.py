@@ -63,7 +63,7 @@ TABLETOP_REWRITES = (
     "in => in the",
     "on => on the",
     "the the => the",
-    "the the => the",
+    "the the => the",  # of three, as "put all of the" leaves
 )
 
 SMALL_TEXT = WordsConfig(vocabulary=TABLETOP_WORDS, rewrites=TABLETOP_REWRITES)

@@ -64,12 +64,12 @@ CHANGES: Mapping[str, Callable[[Picture, Mask, np.random.Generator], NDArray[Any
 }
 """Title of a column -> what is done to the first picture."""
 
-WORDS: Mapping[str, Callable[[int, str, str], str]] = {
-    "ours": lambda number, block, bowl: f"put the {block} block in the {bowl} bowl",
-    "ours, other words": paraphrase,
-    "ours, free words": free_wording,
+WORDS: Mapping[str, Callable[[int, Instruction], str]] = {
+    "ours": lambda number, asked: asked.text,
+    "ours, other words": lambda number, asked: paraphrase(number, asked.thing.color, asked.target.color),
+    "ours, free words": lambda number, asked: free_wording(number, asked.thing.color, asked.target.color),
 }
-"""Line of a table -> the wording, of the scene's number and two colours."""
+"""Line of a table -> the wording, of the scene's number and what is asked for."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class ChangedScene:
         table_HW = (labels_HW == 0) & (rgb == np.array(sampled.info["palette"]["table"])).all(-1)
         changed = change_picture(self.change, rgb, table_HW, np.random.default_rng([self.scene.seed, 4]))
         asked = Instruction.parse(sampled.texts[0])
-        text = WORDS[self.words](self.number, asked.thing.color, asked.target.color)
+        text = WORDS[self.words](self.number, asked)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             rollout = worker.world_model.rollout(changed, [text], horizon=HORIZON, seed=self.seed)

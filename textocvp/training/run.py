@@ -135,8 +135,7 @@ class TrainingSettings(RunPaths):
                 raise SettingsError(f"--{option} is {value}: must be at least {least}")
         for name in BEGINS_WITH:
             source = getattr(self, name, None)
-            path = Path(source or "").resolve()
-            if source is not None and path.exists() and self.out.resolve() in path.parents:
+            if source and (path := Path(source)).exists() and self.out.resolve() in path.resolve().parents:
                 raise SettingsError(
                     f"--{name} {source} lies in --out {self.out}, which this run writes: choose another --out"
                 )
