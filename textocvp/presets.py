@@ -27,6 +27,7 @@ TABLETOP_WORDS = ("put", "the", "block", "in", "bowl", "and", "then", "into", "a
 TABLETOP_COLORS = ("blue", "green", "red", "brown", "cyan", "gray", "yellow")
 # Other wordings of its sentences, for models whose captions have none of them.
 TABLETOP_REWRITES = (
+    "next to | close to => beside",
     "please | kindly | now | just | next one | next | thanks | thank you | carefully | gently | for me | robot => ",
     "hi | hey | hello | okay | would you mind | could you | can you | would you | will you | you should | you can => ",
     "i want you to | i need you to | i would like you to | i'd like you to | i want | i need => ",
@@ -35,15 +36,14 @@ TABLETOP_REWRITES = (
     "grey => gray",
     "blocks | cube | cubes | brick | bricks | piece | pieces => block",
     "bowls | dish | dishes | container | containers | basin | basins => bowl",
-    "all of the | all the | each of the => the",
-    "a | an | one | some | this | that | these | those | my | your => the",
+    "all of the | all the | any of the | each of the | one of the => the",
+    "a | an | some | this | that | these | those | my | your => the",
     "there is | there's | pick up | pick | grab | grasp | lift up | lift | fetch | get | find | see => take",
     "place | move | set | set down | drop | drop off | lay | lay down | stack | put down | transfer | deposit => put",
     "insert | throw | toss | position | bring | carry | shift | relocate | stick | pop | leave | store | rest => put",
     "putting | placing | placed | moving | moved | setting | dropping | dropped => put",
     "into | inside | inside of | in to | within | down into => in",
     "onto | upon | atop | on top of => on",
-    "them => it",
     "put it down => put it",
     "up and put it | and then put it | and put it | then put it => put it",
     "take {thing} put it {place} => put {thing} {place}",
@@ -52,18 +52,6 @@ TABLETOP_REWRITES = (
     "to {place} bowl put {thing} => put {thing} in {place} bowl",
     "should be | should go | should end up | must be | must go | has to be | has to go | needs to be | needs to go => ",
     "shall be | shall go | belongs | goes | go | ends up | end up | be put | is put | to be => ",
-    "in {place} put {thing} => put {thing} in {place}",
-    "on {place} put {thing} => put {thing} on {place}",
-    "in {place} bowl {thing} block => put {thing} block in {place} bowl",
-    "{thing} block put in {place} bowl => put {thing} block in {place} bowl",
-    "{thing} block in {place} bowl => put {thing} block in {place} bowl",
-    "{thing} block on {place} block => put {thing} block on {place} block",
-    "put put => put",
-    "put => put the",
-    "in => in the",
-    "on => on the",
-    "the the => the",
-    "the the => the",  # of three, as "put all of the" leaves
 )
 
 SMALL_TEXT = WordsConfig(vocabulary=TABLETOP_WORDS, rewrites=TABLETOP_REWRITES)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from textocvp.layers import FeedForward, SelfAttention, sinusoids
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
-from textocvp.text.wording import compile_rules, is_negation, reword, split
+from textocvp.text.wording import ELSEWHERE, HOLE, compile_rules, is_negation, match_form, reword, split
 
 # Row 0 is padding, so that a padded batch needs no other bookkeeping. Row 1 is not used: unknown words are left out.
 SPECIAL = ("<pad>", "<unk>", "<color>")
@@ -123,7 +123,7 @@ class WordsConfig(TextConfig):
 
     def form(self, tokens: Iterable[str]) -> str:
         """What a sentence is like: its tokens, with {} for those that name a colour."""
-        return " ".join("{}" if self._is_color(token) else token for token in tokens)
+        return " ".join(HOLE if self.is_color(token) else token for token in tokens)
 
     def knows(self, token: str) -> bool:
         """Whether a token has an embedding that was trained, or for the `lexicon` an RGB."""
@@ -131,7 +131,8 @@ class WordsConfig(TextConfig):
             return token not in self.untrained
         return self.words_have_rgb and tuple(token.split()) in palette()
 
-    def _is_color(self, token: str) -> bool:
+    def is_color(self, token: str) -> bool:
+        """Whether a token names a colour."""
         # Without RGB of their own, colours are words of the vocabulary like any other.
         return tuple(token.split()) in palette() and not (self.words_have_rgb and token in self.vocabulary)
 
@@ -183,11 +184,23 @@ class WordEncoder(TextEncoder):
         return self.embedding.weight.device
 
     def words(self, text: str) -> list[str]:
-        """The tokens of a sentence that are encoded, in order: see `WordsConfig.tokens`.
+        """The tokens of a sentence that are encoded, in order: those of `WordsConfig.tokens` that it knows.
 
-        Those that it does not know are left out: one that was never trained would say something, but nothing true.
+        A sentence of no form of the captions is read as the form that says the same (`match_form`), if there is one.
+        Words that it does not know are left out: one that was never trained would say something, but nothing true.
         """
-        return [token for token in self.config.tokens(text) if self.config.knows(token)]
+        return self._read(text)[0]
+
+    def _read(self, text: str) -> tuple[list[str], bool]:
+        """The tokens that are encoded, and whether they are of a form of the captions, if anybody listed any."""
+        config = self.config
+        tokens = config.tokens(text)
+        known = [token for token in tokens if config.knows(token)]
+        formed = not config.forms or config.form(known) in config.forms
+        if formed and (len(known) == len(tokens) or ELSEWHERE.isdisjoint(tokens)):
+            return known, True
+        said = match_form(tokens, config.forms, config.is_color, config.knows)
+        return said or known, bool(said)
 
     def reads(self, text: str) -> str:
         return " ".join(self.words(text))
@@ -199,8 +212,7 @@ class WordEncoder(TextEncoder):
         return [one for one in split(text) if is_negation(one) and not self.config.knows(one)]
 
     def forms_but(self, text: str) -> tuple[str, ...]:
-        forms = self.config.forms
-        return () if self.config.form(self.words(text)) in forms else forms
+        return () if self._read(text)[1] else self.config.forms
 
     def color_name(self, rgb: Sequence[float]) -> str:
         return min(sorted((*TABLEAU_10, "white", "black")), key=lambda name: math.dist(palette()[name,], rgb))

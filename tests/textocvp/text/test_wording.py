@@ -13,7 +13,7 @@ from tests.textocvp.conftest import PLACED, build
 from textocvp import WorldModel
 from textocvp.presets import TABLETOP_REWRITES, TABLETOP_WORDS
 from textocvp.text import build_text_encoder
-from textocvp.text.wording import compile_rules, reword
+from textocvp.text.wording import compile_rules, match_form, reword
 from textocvp.text.words import MOST_FORMS, WordsConfig
 from textocvp.world_model import bundled_checkpoints
 
@@ -56,6 +56,72 @@ def test_a_paraphrase_is_encoded_as_what_the_model_was_trained_on(shipped: World
     assert torch.equal(tokens.embeddings_BLC, plain.embeddings_BLC)
     assert torch.equal(tokens.colors_BL3, plain.colors_BL3)
     assert Goal.parse(shipped.reads(text)) == Goal.parse(PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("text", "unknown"),
+    [
+        ("drop the red box into the blue basin", ["box"]),
+        ("inside the blue bowl, place the red one", ["one"]),
+        ("Find the blue bowl. Put the red block in it.", ["it"]),
+        ("the block that is red should end up in the bowl that is blue", ["is"]),
+        ("Fill the blue bowl with the red block", ["fill", "with"]),
+        ("put the big red wooden block from the table into the blue bowl", ["big", "wooden", "from", "table"]),
+        ("Pick up the red block. The red block should go in the blue bowl.", []),
+        ("Next, red block, blue bowl!", []),
+    ],
+)
+def test_what_a_sentence_names_decides_its_form(shipped: WorldModel, text: str, unknown: list[str]) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert shipped.reads(text) == PLAIN
+    assert shipped.model.text.unknown_words(text) == unknown
+    named = " ".join(str(warning.message) for warning in caught)
+    assert len(caught) == bool(unknown) and all(repr(word) in named for word in unknown)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "put the red block next to the blue bowl",
+        "put the red block under the blue bowl",
+        "take the red block out of the blue bowl",
+        "move the red block to the left of the blue bowl",
+        "put the red block in front of the blue bowl",
+        "put the blue bowl in the red block",
+        "put the red block on the blue bowl",
+        "swap the red block and the blue block",
+        "put the red block and the green block in the blue bowl",
+        "put the red thing in the blue thing",
+    ],
+)
+def test_another_place_or_another_number_of_things_is_no_form(shipped: WorldModel, text: str) -> None:
+    with pytest.warns(UserWarning, match="trained on 'put the {} block in the {} bowl'"):
+        shipped.reads(text)
+
+
+def test_two_of_one_noun_are_told_apart_by_the_word_between(shipped: WorldModel) -> None:
+    assert match_form(["b", "{}", "on", "{}", "b"], ("a {} b on {} b",), "{}".__eq__, "ab on".__contains__) is None
+    forms = ("put the {} cup on the {} cup", "put the {} cup in the {} pot")
+    known = {word for form in forms for word in form.split()} - {"{}"}
+    colors = {"red", "blue", "gray"}
+
+    def read(text: str) -> str | None:
+        found = match_form(text.split(), forms, colors.__contains__, (known | colors).__contains__)
+        return found and " ".join(found)
+
+    on = "put the red cup on the blue cup"
+    for text in (on, "on the blue cup the red cup", "balance the red cup on the blue thing", "red cup on blue cup"):
+        assert read(text) == on
+    for text in (
+        "the red cup and the blue cup",
+        "red cup beside blue cup",
+        "on the red cup on the blue cup",
+        "red cup",
+    ):
+        assert read(text) is None
+    assert read("the gray pot holds the red cup") == "put the red cup in the gray pot"
+    assert read("put the red cup on the gray pot") is None
 
 
 def test_what_stands_on_something_is_no_bowl(shipped: WorldModel) -> None:
