@@ -51,10 +51,14 @@ class OwnFrames:
     # RRGGBB of a hue that 99 of 100 show and that is another where red and blue change places; empty for none
     hue: str = ""
     gray: bool = False  # whether some of them are gray
+    canvas: str = ""  # RRGGBB of the median pixel, where it is the same in all of them; see `put_right`
+    grain: float = 1.0  # share of neighbouring pixels that differ a little, which 99 of 100 stay below
 
     def __post_init__(self) -> None:
-        if self.hue and (len(self.hue) != 6 or set(self.hue) - set("0123456789abcdef")):
-            raise ValueError(f"own_frames.hue is {self.hue!r}: must be six hexadecimal digits, as 6f4cff")
+        for name in ("hue", "canvas"):
+            value = getattr(self, name)
+            if value and (len(value) != 6 or set(value) - set("0123456789abcdef")):
+                raise ValueError(f"own_frames.{name} is {value!r}: must be six hexadecimal digits, as 6f4cff")
 
 
 def observed_images(obs: Mapping[str, Any] | np.ndarray) -> np.ndarray:

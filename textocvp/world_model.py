@@ -14,6 +14,7 @@ from torch import Tensor
 
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, bundled_checkpoints, resolve_checkpoint
 from textocvp.inputs import (
+    ForeignPictureWarning,
     checked_frames,
     checked_horizon,
     checked_pairs,
@@ -26,6 +27,7 @@ from textocvp.inputs import (
 )
 from textocvp.metrics.frames import psnr
 from textocvp.model import TextOCVP
+from textocvp.pictures.put_right import put_right
 from textocvp.predictors.base import SlotPredictor
 from textocvp.rollout import CHUNK, Rollout
 
@@ -217,8 +219,9 @@ class WorldModel:
         B, T = frames.shape[:-3] if frames.ndim == 5 else (1, len(frames))
         images = frames.reshape(-1, *frames.shape[-3:])
         frames_N3HW = checked_frames(images, self.image_size, self.model.device, "video", multiples=True)
-        parsed = self._parsed(frames_N3HW.unflatten(0, (B, T)), seed, num_slots)
-        self._warn_of_foreign(frames_N3HW[::T], parsed, seed, num_slots, depth=3)
+        frames_BT3HW = self._put_right(frames_N3HW.unflatten(0, (B, T)), depth=3)
+        parsed = self._parsed(frames_BT3HW, seed, num_slots)
+        self._warn_of_foreign(frames_BT3HW[:, 0], parsed, seed, num_slots, depth=3)
         return parsed
 
     def words(self, text: str) -> list[str]:
@@ -265,9 +268,21 @@ class WorldModel:
                 )
             return obs
         frames_B3HW = checked_frames(observed_images(obs), self.image_size, self.model.device, multiples=True)
+        frames_B3HW = self._put_right(frames_B3HW[:, None], depth=5)[:, 0]
         parsed = self._parsed(frames_B3HW[:, None], seed, num_slots)
         self._warn_of_foreign(frames_B3HW, parsed, seed, num_slots, depth=5)
         return parsed
+
+    def _put_right(self, frames_BT3HW: Tensor, depth: int) -> Tensor:
+        """Videos in the light of the model's own world; a `ForeignPictureWarning` where that had to be changed."""
+        own = self.model.config.own_frames
+        if own is None or frames_BT3HW.shape[-2:] != self.image_size:
+            return frames_BT3HW
+        frames_BT3HW, done = put_right(frames_BT3HW, own)
+        if done:
+            said = f"the picture does not look like those that this model was trained on: it is {', and '.join(done)}"
+            warnings.warn(said, ForeignPictureWarning, stacklevel=depth + 1)
+        return frames_BT3HW
 
     def _warn_of_foreign(
         self, frames_B3HW: Tensor, parsed: Rollout, seed: int, num_slots: int | None, depth: int

@@ -20,6 +20,7 @@ from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_
 from textocvp.metrics.masks import MIN_PIXELS
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
+from textocvp.pictures.put_right import canvas, grain
 from textocvp.training.run import Metrics
 
 THRESHOLDS = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90}
@@ -121,7 +122,7 @@ def measure_parser(
 @torch.no_grad()
 def measure_own_frames(model: TextOCVP, episodes: Episodes) -> OwnFrames:
     """How the model redraws the first frames of held-out episodes: what a checkpoint stores to tell others by."""
-    psnrs, shares, hues_C3, gray = [], [], None, False
+    psnrs, shares, canvases, grains, hues_C3, gray = [], [], [], [], None, False
     for at in range(0, len(episodes), 16):
         frames_B3HW = to_frames(episodes.clips(episodes.starts[at : at + 16], 1), model.device)[:, 0]
         values_B3HW = (frames_B3HW + 1) * 127.5
@@ -133,12 +134,17 @@ def measure_own_frames(model: TextOCVP, episodes: Episodes) -> OwnFrames:
         psnrs.append(psnr((drawn_B3HW + 1) / 2, (frames_B3HW + 1) / 2).cpu())
         shares.append(hue_shares(values_B3HW, hues_C3).cpu())
         gray |= bool(are_gray(values_B3HW).any())
+        canvases.append(canvas(values_B3HW).round().cpu())
+        grains.append(grain(values_B3HW).cpu())
     psnr_E, low_C = torch.cat(psnrs), torch.cat(shares).quantile(0.01, 0)
     hue = ""
     if hues_C3 is not None and low_C.amax() >= HUE_SHARE:
         hue = bytes((255 * hues_C3[low_C.argmax()]).round().int().tolist()).hex()
     mean, low = psnr_E.mean().item(), psnr_E.quantile(0.01).item()
-    return OwnFrames(len(psnr_E), round(mean, 2), round(low, 2), hue, gray)
+    canvas_E3, grain_high = torch.cat(canvases), torch.cat(grains).quantile(0.99).item()
+    same = bool((canvas_E3 == canvas_E3[0]).all())
+    its = bytes(canvas_E3[0].int().tolist()).hex() if same else ""
+    return OwnFrames(len(psnr_E), round(mean, 2), round(low, 2), hue, gray, its, round(grain_high, 3))
 
 
 def _hues(values_3HW: Tensor, most: int = 64) -> Tensor:
