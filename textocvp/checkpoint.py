@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -20,6 +21,7 @@ from huggingface_hub import snapshot_download
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from textocvp.config import ModelConfig
 from textocvp.files import replace_text, replacing
@@ -141,23 +143,56 @@ def read_config(folder: Path) -> ModelConfig:
 def load_checkpoint(folder: Path, build_model: Callable[[], M]) -> M:
     """The model that `build_model` makes, with the weights of the checkpoint in `folder`, in evaluation mode.
 
-    It is first made without memory: sizes that do not fit the weights allocate nothing.
+    Sizes that do not fit the weights allocate nothing: if the model would be far larger than those, it is made without
+    memory, for the message.
 
     Raises:
         CheckpointError: if the file is missing or damaged, the tensors are not exactly the model's in name, shape and
             kind of number, or not those that `config.json` has the hash of; or a ValueError of `build_model`.
     """
+    path = folder / WEIGHTS_FILE
     try:
-        with torch.device("meta"):
-            wanted = build_model().state_dict()
-        found = _read_weights(folder, wanted)
-        model = build_model()
+        try:
+            with _NoLarger(path.stat().st_size if path.exists() else 0):
+                model = build_model()
+        except _TooLargeError:
+            with torch.device("meta"):
+                model = build_model()
+        found = _read_weights(folder, model.state_dict())
     except CheckpointError:
         raise
     except (ValueError, TypeError) as error:
         raise CheckpointError(f"{folder / CONFIG_FILE}: {error}") from error
     model.load_state_dict(found)
     return model.eval()
+
+
+class _TooLargeError(Exception):
+    """A tensor is made that the weights cannot fill."""
+
+
+class _NoLarger(TorchFunctionMode):
+    """Lets all calls together make no more numbers than a file of so many bytes has, and a few million.
+
+    PyTorch's meta device makes none at all, but it imports a compiler, which takes seconds.
+    """
+
+    slack = 4_000_000  # numbers
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.left = size + self.slack
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in _FACTORIES:
+            sizes = args[0] if args and isinstance(args[0], Sequence) else args
+            self.left -= math.prod(size for size in sizes if isinstance(size, int) and size)
+            if self.left < 0:
+                raise _TooLargeError
+        return func(*args, **(kwargs or {}))
+
+
+_FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.rand, torch.randn, torch.full, torch.arange, torch.linspace}
 
 
 def _read_weights(folder: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:

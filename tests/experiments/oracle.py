@@ -16,10 +16,12 @@ import torch
 from envs.tabletop import TabletopEnv
 from planning import PinholeCamera
 from tests.planning.oracle import ARM, OracleWorldModel
-from textocvp.presets import TABLETOP_REWRITES
+from textocvp.presets import SMALL_TEXT
 from textocvp.rollout import Rollout
-from textocvp.text.wording import reword
+from textocvp.text import build_text_encoder
 from textocvp.world_model import Checkpoint
+
+READER = build_text_encoder(SMALL_TEXT.for_captions(["put the red block in the blue bowl"]))
 
 _history: list[dict[str, Any]] = []
 
@@ -87,7 +89,7 @@ class StudyOracle:
 
     def rollout(self, obs: Rollout | np.ndarray, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
         parsed = obs if isinstance(obs, Rollout) else self.parse(obs[None], seed=seed)
-        text = [" ".join(reword(one, TABLETOP_REWRITES)) for one in text]
+        text = [READER.reads(one) for one in text]
         return self._oracle().rollout(parsed, text, horizon=horizon, seed=seed)
 
     def _oracle(self) -> OracleWorldModel:

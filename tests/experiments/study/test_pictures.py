@@ -112,7 +112,7 @@ def test_other_words_are_imagined_and_judged_by_the_same_wish() -> None:
 
 
 def test_every_paraphrase_is_a_wording_of_its_own_and_read_as_what_it_means() -> None:
-    encoder = build_text_encoder(SMALL_TEXT)
+    encoder = build_text_encoder(SMALL_TEXT.for_captions(["put the gray block in the blue bowl"]))
     texts = [paraphrase(number, "gray", "light blue") for number in range(100)]
     assert len(set(texts)) > 90 and texts[3] == paraphrase(3, "gray", "light blue")
     assert {encoder.reads(text) for text in texts} == {"put the gray block in the light blue bowl"}
