@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import scipy  # its parts are loaded when they are first used
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
-from scipy.optimize import linear_sum_assignment
 
 from .camera import MIDDLE_HEIGHT, PinholeCamera, View
 from .language import Instruction, Thing
@@ -179,7 +178,7 @@ def _ground_scene(masks_KHW: Bools, colors_K3: Floats, present_K: Bools, view: V
     cost_GN = np.array([np.average(cost_KN[g, : len(names)], axis=0, weights=area_K[g]) for g in groups])
     things = {}
     # Weighted by area, so that a stray fragment never takes a name away.
-    for g, n in zip(*linear_sum_assignment(cost_GN * area_G[:, None]), strict=True):
+    for g, n in zip(*scipy.optimize.linear_sum_assignment(cost_GN * area_G[:, None]), strict=True):
         if n == cost_GN[g].argmin() or cost_GN[g, n] <= SECOND_CHOICE:
             width = apparent_width(np.any(masks_KHW[groups[g]], axis=0), view.camera)
             things[Thing(names[n], "bowl" if width > BOWL_WIDTH else "block")] = tuple(groups[g])
@@ -204,7 +203,7 @@ def apparent_width(mask_HW: Bools, camera: PinholeCamera) -> float:
 def _merge_touching(slots: Sequence[int], name_K: Integers, masks_KHW: Bools, apart: int) -> list[list[int]]:
     groups: list[list[int]] = []
     for slot in slots:
-        near = binary_dilation(masks_KHW[slot], np.ones((3, 3)), iterations=apart)
+        near = scipy.ndimage.binary_dilation(masks_KHW[slot], np.ones((3, 3)), iterations=apart)
         same = [g for g in groups if name_K[g[0]] == name_K[slot] and (near & masks_KHW[g].any(0)).any()]
         merged = sorted([slot, *(other for g in same for other in g)])
         groups = [g for g in groups if g not in same] + [merged]
@@ -242,7 +241,7 @@ def _slots_of_labels(masks_KHW: Bools, truth_HW: Integers, labels: Sequence[int]
     overlap_KN = np.einsum("khw,nhw->kn", masks_KHW.astype(np.float32), true_NHW.astype(np.float32))
     union_KN = masks_KHW.sum((1, 2))[:, None] + true_NHW.sum((1, 2)) - overlap_KN
     iou_KN = overlap_KN / np.maximum(union_KN, 1)
-    rows, columns = (index.tolist() for index in linear_sum_assignment(-iou_KN))
+    rows, columns = (index.tolist() for index in scipy.optimize.linear_sum_assignment(-iou_KN))
     chosen = {k: n for k, n in zip(rows, columns, strict=True) if iou_KN[k, n] > 0}
     # Slots left over go to whatever covers most of them: the robot and the background may take several.
     most_K = {k: int(overlap_KN[k].argmax()) for k in range(len(masks_KHW)) if overlap_KN[k].any()}

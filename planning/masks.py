@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy  # its parts are loaded when they are first used
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def center_inside(inner_HW: Bools, outer_HW: Bools) -> bool:
     if not inner_HW.any() or outer_HW.sum() < 3:
         return False
     try:
-        sides_n3 = ConvexHull(np.argwhere(outer_HW)).equations
-    except QhullError:  # the pixels are all on one line
+        sides_n3 = scipy.spatial.ConvexHull(np.argwhere(outer_HW)).equations
+    except scipy.spatial.QhullError:  # the pixels are all on one line
         return False
     return bool((sides_n3[:, :2] @ np.argwhere(inner_HW).mean(0) + sides_n3[:, 2] <= 0).all())

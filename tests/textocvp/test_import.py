@@ -8,9 +8,17 @@ import sys
 import pytest
 
 
-@pytest.mark.parametrize("module", ["textocvp", "textocvp.cli", "textocvp.world_model"])
+@pytest.mark.parametrize("module", ["textocvp", "textocvp.cli", "textocvp.world_model", "planning"])
 def test_heavy_libraries_wait_until_they_are_needed(module: str) -> None:
-    heavy = ("transformers", "torchmetrics", "accelerate", "lpips", "tensorboard", "matplotlib.pyplot")
+    heavy = (
+        "transformers",
+        "torchmetrics",
+        "accelerate",
+        "lpips",
+        "tensorboard",
+        "matplotlib.pyplot",
+        "scipy.optimize",
+    )
     code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

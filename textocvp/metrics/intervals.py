@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+import scipy  # its parts are loaded when they are first used
 
 CONFIDENCE = 0.95
 QUANTILES = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
@@ -33,7 +33,7 @@ def wilson_interval(successes: int, trials: int) -> Interval:
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"need 0 <= successes <= trials and at least one trial, got {successes} of {trials}")
-    z = float(ndtri(QUANTILES[1]))
+    z = float(scipy.special.ndtri(QUANTILES[1]))
     rate = successes / trials
     center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * (rate * (1 - rate) / trials + z**2 / (4 * trials**2)) ** 0.5

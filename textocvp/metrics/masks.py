@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy  # its parts are loaded when they are first used
 from torch import Tensor
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -82,7 +82,7 @@ def object_ious(
 ) -> ObjectMatches:
     """Match slots to the visible objects of one frame (Hungarian algorithm). Arguments as `overlaps`."""
     ious, slots, ids = overlaps(masks, segmentation, objects, min_pixels=min_pixels)
-    rows, columns = linear_sum_assignment(-ious)
+    rows, columns = scipy.optimize.linear_sum_assignment(-ious)
     matched = ObjectMatches(ids, np.full(len(ids), -1), np.zeros(len(ids)))
     matched.slots[columns] = slots[rows]
     matched.ious[columns] = ious[rows, columns]

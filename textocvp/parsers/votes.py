@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy  # its parts are loaded when they are first used
 import torch
 import torch.nn.functional as F
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from textocvp.layers import full_precision, init_relu_
@@ -243,7 +243,7 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     used_K = state.is_thing[:, 0].cpu().numpy()
     used, free = (FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:]))
     cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
-    rows, columns = linear_sum_assignment(cost_UP)
+    rows, columns = scipy.optimize.linear_sum_assignment(cost_UP)
     sure = cost_UP[rows, columns] < MOST_COST
     owner_P = np.zeros(P, int)
     owner_P[columns[sure]] = used[rows[sure]]
