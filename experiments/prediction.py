@@ -95,8 +95,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
         PredictionClip(scene, shown, seed, "prediction", f"{METRICS[metric]} {mean:.3f}")
         for scene, mean in zip(study_scenes(SPLIT, len(means), seed), means, strict=True)
     ]
-    badness = [-mean if metric == "ssim" else mean for mean in means]
-    return {"clips": extreme_clips(clips, badness, run.sizes.clips)}
+    return {"clips": extreme_clips(clips, [*map(run.measures.badness, means)], run.sizes.clips)}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -234,7 +233,9 @@ STUDY = Study(
     args=Args,
     sizes=lambda args: replace(s := QUICK if args.quick else DEFAULT, scenes=args.scenes or s.scenes),
     methods=IMAGINING,
-    measures=lambda args: available(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out"),
+    measures=lambda args: available(
+        jedi=None if args.quick else args.jedi, jedi_lengths=LENGTHS, without_jedi="a quick run leaves it out"
+    ),
     units=units,
     cases=cases,
     rows=lambda run, found: [*frame_rows(found["scenes"]), *jedi_rows(found["scenes"])],

@@ -175,7 +175,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
             caption = f"{SPLITS[one.scene.split]}; {METRICS[metric]} {mean:.3f}"
             clips.append(PredictionClip(one.scene, run.models, run.args.seed, "robustness", caption, good))
             # A failure is worse than any success; the metrics stay well below 1.
-            badness.append((-mean if metric == "ssim" else mean) + (10.0 if good is False else 0.0))
+            badness.append(run.measures.badness(mean) + (10.0 if good is False else 0.0))
     episodes = episode_clips(found["closed loop"], lambda e: SPLITS[e.scene.split], run.sizes.acted // 2)
     return {"imagined clips": extreme_clips(clips, badness, run.sizes.clips), "robot clips": episodes}
 

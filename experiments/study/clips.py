@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
 from experiments.report.page import Clip, Tone
+from experiments.study.any_size import Film
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome
 from experiments.study.mask_metrics import labels_of
 from experiments.study.methods import HORIZON, Model
@@ -121,7 +123,10 @@ def episode_clips(
     return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]
 
 
-def extreme_clips(clips: Sequence[PredictionClip], badness: Sequence[float], count: int) -> list[PredictionClip]:
+Ranked = TypeVar("Ranked", PredictionClip, Film)  # units with the fields `best` and `rank`
+
+
+def extreme_clips(clips: Sequence[Ranked], badness: Sequence[float], count: int) -> list[Ranked]:
     """The `count` best and then the `count` worst, each with its rank, most extreme first; none is both.
 
     Of an odd number of clips too few for all, the best have one more.
