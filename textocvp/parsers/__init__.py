@@ -8,8 +8,6 @@ from textocvp.parsers.placed import PlacedParser
 from textocvp.parsers.savi import SaviParser
 from textocvp.parsers.votes import VotesParser
 
-__all__ = ["PARSERS", "Parsed", "ParserConfig", "SceneParser", "build_parser", "to_frames"]
-
 PARSERS: dict[str, type[SceneParser]] = {
     "placed": PlacedParser,  # slots with explicit colour, place and size: the parser that ships
     "savi": SaviParser,  # published: slots are unexplained vectors

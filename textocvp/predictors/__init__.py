@@ -7,8 +7,6 @@ from textocvp.predictors.ocvp_seq import OCVPSeqPredictor
 from textocvp.predictors.textocvp import TextOCVPPredictor
 from textocvp.slots import SlotLayout
 
-__all__ = ["PREDICTORS", "Imagined", "PredictorConfig", "SlotPredictor", "build_predictor"]
-
 PREDICTORS: dict[str, type[SlotPredictor]] = {"textocvp": TextOCVPPredictor, "ocvp-seq": OCVPSeqPredictor}
 
 

@@ -11,8 +11,6 @@ from textocvp.renderers.recall import RecallRenderer
 from textocvp.renderers.upsample import UpsampleRenderer
 from textocvp.slots import SlotLayout
 
-__all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "Seen", "build_renderer"]
-
 RENDERERS: dict[str, type[Renderer]] = {
     "glimpse": GlimpseRenderer,  # a small picture a slot, pasted at the slot's place: the renderer that ships
     "carry": CarryRenderer,  # the same, and what the first frame shows is copied from it
