@@ -34,6 +34,7 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from experiments.study.scenes import StudyScene, place_of, scene_hash, study_scenes
+from experiments.study.wordings import FREE
 from planning import AppearanceGrounder
 from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
@@ -433,6 +434,7 @@ STUDY = Study(
     horizon=HORIZON,
     methods=(*IMAGINING, *ACTING),
     measures=lambda args: available(),
+    inputs=lambda args: [FREE],
     units=units,
     cases=cases,
     rows=rows,

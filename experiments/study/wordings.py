@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 VERBS = ("place", "move", "set", "drop", "put")
@@ -32,51 +34,11 @@ def paraphrase(number: int, block: str, bowl: str) -> str:
     return (text, text, text.capitalize(), text.upper())[int(rng.integers(4))] + one_of(AFTER)
 
 
-# Written by somebody who had seen neither the models' rules nor the wordings that these were made from.
-FREE = (
-    "place the {block} block in the {bowl} bowl",
-    "move the {block} block to the {bowl} bowl",
-    "set the {block} block down in the {bowl} bowl",
-    "drop the {block} block into the {bowl} bowl",
-    "put the {block} block inside the {bowl} bowl",
-    "put the {block} block into the {bowl} bowl",
-    "stick the {block} block within the {bowl} bowl",
-    "transfer the {block} block over into the {bowl} bowl",
-    "in the {bowl} bowl put the {block} block",
-    "into the {bowl} bowl, drop the {block} block",
-    "inside the {bowl} bowl, place the {block} one",
-    "the {bowl} bowl is where you should put the {block} block",
-    "put all the {block} blocks in the {bowl} bowl",
-    "put a {block} block in a {bowl} bowl",
-    "move those {block} blocks into that {bowl} bowl",
-    "drop any {block} block in the {bowl} bowl",
-    "Could you please put the {block} block in the {bowl} bowl?",
-    "hey robot, would you mind moving the {block} block into the {bowl} bowl? thanks!",
-    "Good morning! Please place the {block} block inside the {bowl} bowl for me.",
-    "ok next one, can you drop the {block} block in the {bowl} bowl please",
-    "PUT THE {block} BLOCK IN THE {bowl} BOWL",
-    "Put The {block} Block In The {bowl} Bowl!!!",
-    "{block} block,in the {bowl} bowl...",
-    "put   the {block} block , in the {bowl} bowl .",
-    "put the {block} cube in the {bowl} dish",
-    "place the {block} brick inside the {bowl} container",
-    "drop the {block} box into the {bowl} basin",
-    "set the {block} piece in the {bowl} cup",
-    "pick up the {block} block and put it in the {bowl} bowl",
-    "grab the {block} block, then drop it into the {bowl} bowl",
-    "take the {block} block and place it inside the {bowl} bowl",
-    "lift the {block} cube and set it down in the {bowl} bowl",
-    "Pick up the {block} block. Put it in the {bowl} bowl.",
-    "See the {block} block? Move it into the {bowl} bowl.",
-    "Find the {bowl} bowl. Put the {block} block in it.",
-    "Get the {block} block. Now drop it in the {bowl} bowl.",
-    "the {block} block should go in the {bowl} bowl",
-    "I want the {block} block in the {bowl} bowl",
-    "I'd like to see the {block} block inside the {bowl} bowl",
-    "the {block} block belongs in the {bowl} bowl",
-)
+FREE = Path(__file__).with_name("free-wordings.txt")
+"""Written by somebody who had seen neither the models' rules nor the wordings that these were made from."""
 
 
 def free_wording(number: int, block: str, bowl: str) -> str:
     """One of `FREE` instead of "put the {block} block in the {bowl} bowl"."""
-    return FREE[number % len(FREE)].format(block=block, bowl=bowl)
+    wordings = FREE.read_text().splitlines()
+    return wordings[number % len(wordings)].format(block=block, bowl=bowl)
