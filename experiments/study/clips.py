@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -123,6 +123,7 @@ def episode_clips(
     return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]
 
 
+Case = TypeVar("Case", bound=Any)  # a unit with the fields `scene`, `best` and `rank`
 Ranked = TypeVar("Ranked", PredictionClip, Film)  # units with the fields `best` and `rank`
 
 
@@ -139,6 +140,18 @@ def extreme_clips(clips: Sequence[Ranked], badness: Sequence[float], count: int)
         for good, chosen in ((True, order[:best]), (False, order[::-1][:worst]))
         for rank, i in enumerate(chosen, start=1)
     ]
+
+
+def extremes_by_scene(cases: Sequence[Case], badness: Sequence[Any], count: int) -> list[Case]:
+    """The `count` best and the `count` worst cases, each of another scene, with their ranks."""
+    chosen = []
+    for best in (True, False):
+        firsts: dict[int, Case] = {}
+        for i in sorted(range(len(cases)), key=badness.__getitem__, reverse=not best):
+            firsts.setdefault(cases[i].scene.seed, cases[i])
+        ranked = enumerate(list(firsts.values())[:count], start=1)
+        chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
+    return chosen
 
 
 def best_and_worst(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
