@@ -118,7 +118,7 @@ def read_results(folder: Path) -> Results | None:
     """The results of a study; None where there are none that can be read."""
     try:
         return Results.read(folder / "results.json")
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return None
 
 
