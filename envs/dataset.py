@@ -454,13 +454,7 @@ Backend = Literal["processes", "dask", "ray"]
 
 
 def collect(
-    config: World,
-    episodes: int,
-    out: Path,
-    workers: int = 1,
-    backend: Backend = "processes",
-    *,
-    fresh: bool = False,
+    config: World, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes", *, fresh: bool = False
 ) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 

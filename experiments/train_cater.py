@@ -126,15 +126,7 @@ def steps(args: Args) -> list[Step]:
 
     def slots(name: str, parser: str) -> Step:
         checkpoint = f"{out}/{parser}/checkpoint"
-        command = (
-            sys.executable,
-            __file__,
-            "--parse",
-            checkpoint,
-            str(out / name),
-            "--workers",
-            str(args.workers),
-        )
+        command = (sys.executable, __file__, "--parse", checkpoint, str(out / name), "--workers", str(args.workers))
         return Step(name, (*command, "--out", str(out)), out / name / DONE, ("train", "val", parser))
 
     reads = ("--workers", {"toy": "0", "cpu": "1", "gpu": "4"}[args.scale])

@@ -245,11 +245,7 @@ def draw_times(rng: np.random.Generator) -> tuple[int, int]:
 
 
 def _draw_act(
-    rng: np.random.Generator,
-    things: tuple[Thing, ...],
-    number: int,
-    acting: Sequence[int],
-    action: Action | None,
+    rng: np.random.Generator, things: tuple[Thing, ...], number: int, acting: Sequence[int], action: Action | None
 ) -> Act | None:
     thing = things[number]
     start, stop = draw_times(rng)

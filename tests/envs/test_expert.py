@@ -12,13 +12,7 @@ from envs import Expert
 from envs.scenes import SIMPLE
 
 Make = Callable[..., gym.Env[Any, Any]]
-STARTS = (
-    {},
-    {"arm_start": "random"},
-    {"blocks_in_bowls": 2},
-    {"target_in_bowl": True},
-    {"n_objects": 8, "n_bowls": 5},
-)
+STARTS = ({}, {"arm_start": "random"}, {"blocks_in_bowls": 2}, {"target_in_bowl": True}, {"n_objects": 8, "n_bowls": 5})
 
 
 def play(env: gym.Env[Any, Any], instruction: str | None = None) -> tuple[float, bool, dict[str, Any], list[Any]]:

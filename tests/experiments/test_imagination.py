@@ -9,16 +9,7 @@ import pytest
 
 import textocvp
 from envs.tasks.rearrange import FAMILIES
-from experiments.imagination import (
-    ATTEMPTS,
-    SEEDS,
-    STUDY,
-    Args,
-    Episode,
-    Sizes,
-    family_scene,
-    goal_of,
-)
+from experiments.imagination import ATTEMPTS, SEEDS, STUDY, Args, Episode, Sizes, family_scene, goal_of
 from experiments.study.foresight import CASES, LINES, OURS, ByFilms, Foresight, TrueSlotsPlanner, foresight
 from experiments.study.pool import Worker
 from experiments.study.run import UsageError, run

@@ -63,11 +63,7 @@ def test_success_wants_both_the_carry_and_the_placement() -> None:
 
 
 def test_scores_rank_nearer_and_longer_higher() -> None:
-    near, far, lost = (
-        ([9.0] * 4, [9, 9, 1, 1]),
-        ([9.0] * 4, [9, 9, 6, 6]),
-        ([9.0] * 4, [9, 9, float("inf"), 9]),
-    )
+    near, far, lost = (([9.0] * 4, [9, 9, 1, 1]), ([9.0] * 4, [9, 9, 6, 6]), ([9.0] * 4, [9, 9, float("inf"), 9]))
     place = partial(placement_score, limits=LIMITS)
     assert place(trace(*near)) > 0 > place(trace(*far)) > place(trace(*lost))
     assert torch.isfinite(place(trace(*lost))).all()
