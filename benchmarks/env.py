@@ -5,8 +5,6 @@ CPU time of this one process, so that other work on the machine counts as little
 25 ms of an episode for each of its frames.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ often one random sentence reaches the goal, beside the share of the sentences th
 how many sentences are needed. 60 scenes of each take 3 CPU minutes. Names every seed in which the expert failed.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ page; the others are run all the same, and the exit status is 1. Writes a folder
 `summary.md`: tables for the README.
 """
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys

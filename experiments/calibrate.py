@@ -7,8 +7,6 @@ in `planning/` with the printed evidence. The script checks that what is frozen 
 with an error if it does not. It never writes into the code.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ was put over something is told to slide away: does what is inside go with it? Th
 world, so the paper's figures are of other pictures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -11,8 +11,6 @@ best, its motion is carried out in PyBullet, and the simulator alone judges. Wri
 `timings.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

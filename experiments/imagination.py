@@ -15,8 +15,6 @@ outcome in one step then foresees by whole films. Writes `results.json`, `timing
 into `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product

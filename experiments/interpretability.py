@@ -11,8 +11,6 @@ the same slots under a sentence that names something else, and the model with it
 because that term alone could decide. Writes `results.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast

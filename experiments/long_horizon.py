@@ -11,8 +11,6 @@ shows what carrying out alone achieves; random steps; and the scripted expert. T
 Writes `results.json`, `timings.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product

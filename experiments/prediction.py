@@ -9,8 +9,6 @@ moving the wrong thing earns, `true frames` what this renderer can earn at best.
 JEDi those of V-JEPA 2; without them the report says what to fetch. Writes `results.json`, `report.html`, plots, clips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -9,8 +9,6 @@ baselines and controls. The first table holds the bars: closed-loop success, and
 weights of AlexNet are not there) smaller than MAGE's. Writes `results.json`, `report.html`, plots and clips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product

@@ -11,8 +11,6 @@ nothing else. Competitors take turns in every round, so ratios hold on a busy ma
 travel between machines. Writes `results.json` and `report.html` into `--out`.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -9,8 +9,6 @@ Each step is a command that can also be typed. Steps that need nothing of each o
 at any moment and start again: finished steps are skipped, an unfinished one goes on where it was.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

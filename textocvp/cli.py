@@ -1,7 +1,5 @@
 """The command line: `textocvp train`, `rollout`, `play`, `models`, `info`, `measure` and `weights`."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Clips of CATER-hard for `envs.dataset`: what `python -m envs.collect --world cater` writes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass

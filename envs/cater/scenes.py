@@ -5,8 +5,6 @@ shapes, three sizes, two materials, eight colours, a table from -3 to 3 in x and
 Motion is kinematic: things do not touch each other, so nothing needs to be simulated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil, hypot, pi

@@ -1,7 +1,5 @@
 """CATER's table in PyBullet: a clip's things as bodies without physics, drawn frame by frame."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from itertools import product
 from math import cos, pi, sin

@@ -1,7 +1,5 @@
 """Generated shapes: the lathed bowl, for the eye and for contact. No asset package is needed."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile

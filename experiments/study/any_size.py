@@ -1,7 +1,5 @@
 """Episodes of any size: what models of another size imagine, how it fits the truth, and films of both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """Episodes that are CLIPort's or look so: where they come from, and by what an imagined sentence succeeds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import cast
 

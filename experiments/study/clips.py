@@ -1,7 +1,5 @@
 """Clips for a report: imagined beside real, the best cases and the worst ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar

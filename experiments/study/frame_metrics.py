@@ -1,7 +1,5 @@
 """How much imagined frames look like the real ones, frame by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

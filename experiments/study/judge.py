@@ -1,7 +1,5 @@
 """Do imagined rollouts show what the sentence says? Judged on their masks (paper, section 4.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

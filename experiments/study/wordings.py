@@ -1,7 +1,5 @@
 """The tabletop's sentence in other words: every kind that users were seen to write, drawn at random."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

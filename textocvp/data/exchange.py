@@ -4,8 +4,6 @@ LeRobot's layout is written and read with pyarrow, so that frames stay what they
 its dependencies is needed. Minari's own library writes and reads its sets, without its JPEG encoding.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """Videos of your own, with a sentence each, made into an episode file: `textocvp data` (docs/own-videos.md)."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

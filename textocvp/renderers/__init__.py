@@ -1,7 +1,5 @@
 """From slots to frames and masks: one file a renderer, and the table that names them."""
 
-from __future__ import annotations
-
 from textocvp.renderers.base import Rendered, Renderer, RendererConfig, Seen
 from textocvp.renderers.broadcast import BroadcastRenderer
 from textocvp.renderers.carry import CarryRenderer
