@@ -6,8 +6,6 @@ death, may never shrink, and must in the end be what a run leaves that nobody ki
 the checkpoint tensor by tensor. Half an hour of one core for 100 deaths. Ends with status 1 if anything differs.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

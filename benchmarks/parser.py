@@ -6,8 +6,6 @@ All objects of at least 4 visible pixels count. Bars for scenes `varied` at 168x
 robot IoU .90, followed .95.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -5,8 +5,6 @@ outcomes, in turns; in how many `val` scenes of `PutBlockInBowl-v0` both choose 
 in scenes of `RearrangeBlocks-v0` that need three sentences. About 5 minutes on 2 cores.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gymnasium as gym

@@ -5,8 +5,6 @@ Gymnasium; without an import, ``gymnasium.make("textocvp.envs:PutBlockInBowl-v0"
 ``"envs:PutBlockInBowl-v0"`` in a checkout.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry

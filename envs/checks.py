@@ -1,7 +1,5 @@
 """Checks of constructor arguments, with messages that say what is allowed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from math import inf
 from typing import Any

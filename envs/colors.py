@@ -1,7 +1,5 @@
 """The colours of the tabletop: how things look, and which colours captions may name."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 RGB = tuple[int, int, int]

@@ -15,7 +15,7 @@ from functools import cache
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -46,54 +46,53 @@ EPISODES_PER_MERGE = 500
 FRAMES_PER_CHUNK = 4  # a clip of 6 frames touches two or three; larger ones unpack more that is thrown away
 
 
-class World(Protocol):
+Columns = dict[str, tuple[Any, Callable[[Any], Any]]]  # name -> type, and value of what `World.record` yields
+Arrays = dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]]
+
+
+class World:
     """What decides, beside the number, the content of an episode: `EpisodeConfig`, or another world's.
 
-    Hashable, picklable. A new world writes this and adds itself to `envs.collect`.
+    A new world is a picklable frozen dataclass with these fields and methods, and adds itself to `envs.collect`.
     """
 
-    @property
-    def split(self) -> str:
-        """A name of `SPLITS`."""
+    split: str  # a name of `SPLITS`
+    image_size: int  # height and width of frames, in pixels
+    sentences: int = 1  # how many episodes in a row are made together
 
     @property
-    def image_size(self) -> int:
-        """Height and width of frames, in pixels."""
-
-    @property
-    def sentences(self) -> int:
-        """How many episodes in a row are made together."""
-
-    @property
-    def arrays(self) -> dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]]:
-        """The data sets over frames, of `ARRAYS` or like them."""
+    def arrays(self) -> Arrays:
+        """The data sets over frames: all of `ARRAYS`, or others like them."""
+        return ARRAYS
 
     @property
     def columns(self) -> Columns:
-        """The data sets over episodes: name -> type, and value of what `record` yields."""
+        """The data sets over episodes."""
+        raise NotImplementedError
 
     @property
     def attributes(self) -> dict[str, Any]:
         """Of the file, beside format, split and configuration."""
-
-    def __hash__(self) -> int:
-        """Of all that is in it."""
+        raise NotImplementedError
 
     def to_json(self) -> str:
         """By which files are compared."""
+        return json.dumps(asdict(self))  # type: ignore[call-overload]
 
     def make(self) -> Any:
         """What `record` needs, made once in every process."""
+        raise NotImplementedError
 
     def record(self, env: Any, numbers: range) -> Iterator[Any]:
         """Episodes of the split, each with `arrays`; a function of the configuration and the numbers alone."""
+        raise NotImplementedError
 
 
 # -- One episode -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class EpisodeConfig:
+class EpisodeConfig(World):
     """What, beside the seed, decides the content of an episode of the tabletop."""
 
     split: str
@@ -134,22 +133,22 @@ class EpisodeConfig:
         return make_setup(self.scene, self.camera, self.sizes, self.factors, self.object_scale)
 
     def record(self, env: TabletopEnv, numbers: range) -> Iterator[RecordedEpisode]:
-        """See `record_episodes`."""
-        return record_episodes(env, self, numbers)
-
-    @property
-    def arrays(self) -> dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]]:
-        """The data sets over frames."""
-        return ARRAYS
+        """Play episodes in an environment of `make`, whatever it did before."""
+        if self.policy == "expert":
+            yield from (record_episode(env, self, number) for number in numbers)
+            return
+        many = self.sentences
+        for scene in range(numbers.start // many, -(-numbers.stop // many)):
+            for episode in record_sentences(env, self, scene):
+                if scene * many + episode.sentence in numbers:
+                    yield episode
 
     @property
     def columns(self) -> Columns:
-        """The data sets over episodes."""
         return _COLUMNS if self.policy == "expert" else _COLUMNS | _SENTENCE_COLUMNS
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """The file's attributes, beside its format and configuration."""
         setup, ur5 = self.setup, find_package()
         camera = Camera(setup.camera, self.image_size, setup.oversampling)
         return {
@@ -163,7 +162,6 @@ class EpisodeConfig:
         }
 
     def to_json(self) -> str:
-        """The configuration, by which files are compared."""
         values = asdict(self) | {"factors": asdict(self.setup.factors)}
         if self.policy == "expert":  # as in files that are older than other policies
             del values["policy"], values["sentences"]
@@ -185,21 +183,6 @@ class RecordedEpisode:
     sentence: int = 0  # its number in its scene
     primitives: tuple[dict[str, Any], ...] = ()  # `frame` at which each begins, and `action`, as in the file
     supports: tuple[Supports, Supports] = ((), ())  # before and after it, by object, with "any-sentence"
-
-
-def record_episodes(env: TabletopEnv, config: EpisodeConfig, numbers: range) -> Iterator[RecordedEpisode]:
-    """Play episodes of the split in an environment of `EpisodeConfig.make`.
-
-    A function of the configuration and the numbers alone, whatever the environment did before.
-    """
-    if config.policy == "expert":
-        yield from (record_episode(env, config, number) for number in numbers)
-        return
-    many = config.sentences
-    for scene in range(numbers.start // many, -(-numbers.stop // many)):
-        for episode in record_sentences(env, config, scene):
-            if scene * many + episode.sentence in numbers:
-                yield episode
 
 
 def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Iterator[RecordedEpisode]:
@@ -234,7 +217,7 @@ def record_sentences(env: TabletopEnv, config: EpisodeConfig, scene: int) -> Ite
 
 
 def record_episode(env: TabletopEnv, config: EpisodeConfig, episode: int) -> RecordedEpisode:
-    """Let the expert play episode number ``episode`` of the split; see `record_episodes`."""
+    """Let the expert play episode number ``episode`` of the split."""
     seed = SPLITS[config.split].seed(episode)
     options = config.options(seed)
     _, info = env.reset(seed=seed, options=options)
@@ -338,7 +321,7 @@ SIDE = -1  # stands for the image size in the shapes below
 _IMAGE = {"compression": "gzip", "compression_opts": 1}
 _POSE = {"compression": "lzf"}
 # Name -> shape of a frame's value, type, frames in a chunk, compression.
-ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
+ARRAYS: Arrays = {
     "frames": ((SIDE, SIDE, 3), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "segmentation": ((SIDE, SIDE), "u1", FRAMES_PER_CHUNK, _IMAGE),
     "arm": ((6,), "f4", 256, {}),
@@ -349,7 +332,6 @@ ARRAYS: dict[str, tuple[tuple[int, ...], str, int, dict[str, Any]]] = {
     "object_orientation": ((MAX_OBJECTS, 4), "f4", 256, _POSE),
 }
 TEXT = h5py.string_dtype()
-Columns = dict[str, tuple[Any, Callable[[Any], Any]]]
 # Name -> type and value of an episode; where it starts is known when it is written.
 _COLUMNS: Columns = {
     "length": ("i8", lambda episode: len(episode.arrays["frames"])),
@@ -472,13 +454,7 @@ Backend = Literal["processes", "dask", "ray"]
 
 
 def collect(
-    config: World,
-    episodes: int,
-    out: Path,
-    workers: int = 1,
-    backend: Backend = "processes",
-    *,
-    fresh: bool = False,
+    config: World, episodes: int, out: Path, workers: int = 1, backend: Backend = "processes", *, fresh: bool = False
 ) -> None:
     """Bring the file ``out`` to at least ``episodes`` episodes of the split.
 

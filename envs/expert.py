@@ -1,7 +1,5 @@
 """The scripted expert: it knows where everything is, and plays any instruction the scene allows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

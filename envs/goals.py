@@ -1,7 +1,5 @@
 """Goal and state as numbers, and the rewards: for policies that read neither sentences nor pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """``reset(options=...)`` and fixed lists of scenes, checked as a whole before anything changes."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping, Sequence

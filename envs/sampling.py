@@ -1,7 +1,5 @@
 """Random scenes. Everything is drawn from one generator, so a seed is a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import dist, hypot, pi

@@ -1,7 +1,5 @@
 """Action and observation spaces of the environments."""
 
-from __future__ import annotations
-
 import string
 from collections.abc import Sequence
 from math import pi

@@ -1,7 +1,5 @@
 """The splits of the data set: which seeds, and what their scenes are like."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Videos of whole motions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

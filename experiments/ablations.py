@@ -10,8 +10,6 @@ them, this study measures them, on scenes that no training has seen. A run that 
 names the command that trains it. Writes `results.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

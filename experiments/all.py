@@ -9,8 +9,6 @@ page; the others are run all the same, and the exit status is 1. Writes a folder
 `summary.md`: tables for the README.
 """
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys
@@ -118,7 +116,7 @@ def read_results(folder: Path) -> Results | None:
     """The results of a study; None where there are none that can be read."""
     try:
         return Results.read(folder / "results.json")
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return None
 
 

@@ -7,8 +7,6 @@ in `planning/` with the printed evidence. The script checks that what is frozen 
 with an error if it does not. It never writes into the code.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -33,10 +31,10 @@ from planning import (
     Instruction,
     Palette,
     PinholeCamera,
-    SuccessCriterion,
     Thing,
     Trace,
     measure,
+    succeeds,
 )
 from planning.grounding import BOWL_WIDTH, apparent_width, color_distance
 from planning.masks import centroids
@@ -114,9 +112,9 @@ def main(args: Args) -> bool:
 
 def report_success(measured: Measured) -> bool:
     """The success thresholds: who passes, and how much room there is."""
-    limits, criterion, within = THRESHOLDS, SuccessCriterion(), float(measured.own[0].within_B)
+    limits, within = THRESHOLDS, float(measured.own[0].within_B)
     named = {"its own": measured.own, "another target of the scene": measured.other}
-    passed, wrongly = (float(np.mean([bool(criterion(trace)) for trace in its])) for its in named.values())
+    passed, wrongly = (float(np.mean([bool(succeeds(trace)) for trace in its])) for its in named.values())
     shares = (passed, ">= 0.99"), (wrongly, "<= 0.01")
     show(
         f"Success, judged with {limits} and at most {within:g} px to the target",

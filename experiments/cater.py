@@ -11,10 +11,9 @@ was put over something is told to slide away: does what is inside go with it? Th
 world, so the paper's figures are of other pictures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from operator import attrgetter
 from typing import Any, cast
@@ -29,14 +28,14 @@ from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Line, Paper, TableSpec
-from experiments.study.any_size import Seen, drawn, film, imagine, mask_curves
+from experiments.study.any_size import Film, Seen, compare, drawn, imagine, length_columns
 from experiments.study.attention import glow
 from experiments.study.cater import CaterScene, Judged, cater_scenes, judge, slots_of_things
 from experiments.study.clips import extreme_clips
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import Model, lines
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import Prediction, hold_last, to_uint8
+from experiments.study.predictions import hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from textocvp.data.episodes import Episode, EpisodeObject
 from textocvp.slots import SlotState
@@ -111,12 +110,8 @@ class CaterUnit:
         models: dict[str, Any] = {"ours": ours, **{m.key: worker.model(m.load) for m in self.models}}
         still = Seen(real_T3HW[:1], drawn(ours.parse(truth.frames[:1], seed=self.seed), SIDE).labels)
 
-        def compare(method: str, seen: Seen) -> None:
-            scores = scorer.score(Prediction(method, hold_last(seen.frames, T)))
-            curves = {**scores.curves, **mask_curves(hold_last(seen.labels, T), truth)}
-            for (length, frames), (metric, curve) in product(LENGTHS.items(), curves.items()):
-                if np.isfinite(curve[:frames]).any():
-                    figures[method, length, metric] = float(np.nanmean(curve[:frames]))
+        def measure(method: str, seen: Seen) -> None:
+            figures.update(compare(scorer, method, seen, truth, LENGTHS))
 
         def control(method: str, shown: Mapping[Actions, Seen]) -> None:
             judged: list[Judged] = []
@@ -135,23 +130,23 @@ class CaterUnit:
         captions = dict.fromkeys([clip, *others])
         for name, model in models.items():
             shown = {one: imagine(worker, model, first, one.instruction, T - 1, self.seed) for one in captions}
-            compare(name, shown[clip])
+            measure(name, shown[clip])
             control(name, shown)
             if name == "ours" and others:
                 wrong = dict(zip(captions, [*list(shown.values())[1:], shown[clip]], strict=True))
-                compare("wrong text", wrong[clip])
+                measure("wrong text", wrong[clip])
                 control("wrong text", wrong)
             if hasattr(model, "rollout") and (went := follows(model, clip, truth, self.seed)) is not None:
                 figures[name, "control", "hidden_follows"] = went
-        compare("true frames", drawn(ours.parse(truth.frames, seed=self.seed), SIDE))
         own = drawn(ours.parse(truth.frames, seed=self.seed), SIDE)
+        measure("true frames", own)
         control("true frames", {clip: own})
-        compare("copy frame", still)
+        measure("copy frame", still)
         control("copy frame", dict.fromkeys(captions, still))
         return figures
 
 
-def watched(scene: CaterScene) -> Episode:
+def watched(scene: CaterScene, worker: Worker | None = None) -> Episode:
     """What the simulator shows of a scene."""
     clip = scene.clip()
     frames, labels = scene.watch(SIDE)
@@ -179,31 +174,6 @@ def follows(model: Any, clip: Actions, truth: Episode, seed: int) -> float | Non
     cone_T2, inside_T2 = went[:, slots[act.thing]], went[:, slots[act.into]]
     moved = float((cone_T2[-1] - cone_T2[0]).norm()) > FOLLOWED
     return float(moved and float((cone_T2[-1] - inside_T2[-1]).norm()) <= FOLLOWED)
-
-
-@dataclass(frozen=True)
-class Film:
-    """A unit of work: what happened beside what ours imagines, above the masks."""
-
-    scene: CaterScene
-    seed: int
-    caption: str
-    best: bool = True
-    rank: int = 1
-
-    def run(self, worker: Worker) -> Clip:
-        """Imagine it once more."""
-        truth = watched(self.scene)
-        seen = imagine(worker, worker.world_model, truth.frames[0], truth.instruction, len(truth.frames) - 1, self.seed)
-        place = f"{'best' if self.best else 'worst'} {self.rank}"
-        return Clip(
-            name=f"cater-{place.replace(' ', '-')}.gif",
-            gif=film(truth, seen),
-            panels=("real", "ours"),
-            title=truth.instruction,
-            caption=f"{self.caption}; seed {self.scene.seed}",
-            badge=place,
-        )
 
 
 COLUMNS = ("size", "colour", "material", "shape", "action", "cell x", "cell y")
@@ -262,13 +232,15 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """Films of the scenes that look best and worst."""
     metric, scenes = run.measures.main, cater_scenes(run.sizes.scenes, run.args.seed)
     values = [figures["ours", "clip", metric] for figures in found["scenes"]]
-    films: Any = [
-        Film(scene, run.args.seed, f"{METRICS[metric]} {value:.3f}")
+    films = [
+        Film("cater", partial(watched, scene), run.args.seed, f"{METRICS[metric]} {value:.3f}; seed {scene.seed}")
         for scene, value in zip(scenes, values, strict=True)
     ]
-    badness = [-value if metric == "ssim" else value for value in values]
     attention = [Attention(scene, run.args.seed) for scene in scenes[: run.sizes.clips]]
-    return {"films": extreme_clips(films, badness, run.sizes.clips), "attention": attention}
+    return {
+        "films": extreme_clips(films, [*map(run.measures.badness, values)], run.sizes.clips),
+        "attention": attention,
+    }
 
 
 def headline(run: Run) -> dict[str, Key]:
@@ -287,17 +259,9 @@ def headline(run: Run) -> dict[str, Key]:
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 
-def _columns(*metrics: str) -> list[Column]:
-    names = {**METRICS, "iou": "mask IoU"}
-    return [
-        Column(f"{names[m]} {length.removesuffix(' frames')}", SPLIT, length, m, 2 if m == "psnr" else 3)
-        for length, m in product(LENGTHS, metrics)
-    ]
-
-
 FRAMES = TableSpec(
     "Frames",
-    _columns("psnr", "ssim", "lpips"),
+    length_columns(SPLIT, LENGTHS, ("psnr", "ssim", "lpips")),
     list(LINES.values()),
     "PSNR, SSIM: higher is better; LPIPS (AlexNet): lower. A scene in which two small things act is nearly still.",
 )
@@ -341,13 +305,6 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     ]
 
 
-def measures(args: Args) -> Measures:
-    """LPIPS beside PSNR and SSIM."""
-    found = available_measures()
-    reasons = tuple(one for one in found.reasons if one[0] == "lpips")
-    return Measures(tuple(m for m in found.perceptual if m == "lpips"), reasons=reasons)
-
-
 def rows(run: Run, found: Found) -> list[Row]:
     """Every figure, a mean over scenes."""
     return figure_rows((SPLIT, figures) for figures in found["scenes"])
@@ -360,7 +317,7 @@ STUDY = Study(
     args=Args,
     sizes=lambda args: Sizes(args.scenes or 4, 1, 1) if args.quick else Sizes(args.scenes or 60, VARIANTS, 4),
     methods=[line.key for line in MEASURED],
-    measures=measures,
+    measures=lambda args: available_measures(["lpips"]),
     units=units,
     cases=cases,
     rows=rows,

@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, cast
@@ -23,23 +24,23 @@ import numpy as np
 import torch
 
 from envs.tasks.base import CLIPORT_RADIUS
-from experiments.report.page import CardSpec, Clip, Clips, Section
+from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, Paper, TableSpec
-from experiments.study.any_size import Seen, drawn, film, fitted, imagine, mask_curves
+from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns
 from experiments.study.cliport import Recorded, Source, misses, other_sentences, read
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import HORIZON, METHODS, Method, Model, lines
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import Prediction, hold_last
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
 from planning import THRESHOLDS, BeamPlanner, Goal, Imagines, Instruction, LiteralController, Planner, RandomPlanner
 from textocvp.data import open_episodes
 from textocvp.data.cliport import CliportEpisodes
+from textocvp.data.episodes import Episode
 
 SIDE = 336  # pixels of our own scenes, as in the paper
 ALL = "all"  # the split of figures over all episodes
@@ -225,12 +226,7 @@ class EpisodeUnit:
 
         def measure(method: str, seen: Seen, of_others: Iterable[Seen] = ()) -> None:
             """Figures of what is shown of the sentence, and of the others, as far as they are shown."""
-            scores = scorer.score(Prediction(method, hold_last(seen.frames, T)))
-            curves = {**scores.curves, **mask_curves(hold_last(seen.labels, T), truth)}
-            for variant, length in zip(VARIANTS, (*LENGTHS.values(), T - 1), strict=True):
-                for metric, curve in curves.items():
-                    if 0 < length < T and np.isfinite(curve[:length]).any():
-                        figures[method, variant, metric] = float(np.nanmean(curve[:length]))
+            figures.update(compare(scorer, method, seen, truth, {**LENGTHS, "episode": T - 1}))
             off = misses(seen.labels, truth, asked)
             off_others = [misses(s.labels, truth, o) for o, s in zip(others, of_others, strict=False)]
             for variant, its in zip(SENTENCES, ([off], off_others), strict=True):
@@ -256,32 +252,10 @@ class EpisodeUnit:
 # --- work -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Film:
-    """A unit of work: what happened beside what ours imagines, above the masks."""
-
-    source: Source
-    seed: int
-    caption: str
-    best: bool = True
-    rank: int = 1
-
-    def run(self, worker: Worker) -> Clip:
-        """Imagine it once more."""
-        source, truth = self.source, read(self.source, worker)
-        asked, ahead = Instruction.parse(truth.instruction), len(truth.frames) - 1
-        seen = imagine(worker, worker.world_model, truth.frames[0], asked.text, ahead, self.seed)
-        off, place = misses(seen.labels, truth, asked), f"{'best' if self.best else 'worst'} {self.rank}"
-        ends = "" if off is None else f"; block ends {100 * off[-1]:.1f} cm off"
-        name = f"{source.split}, seed {source.seed}" if isinstance(source, StudyScene) else source.name
-        return Clip(
-            name=f"cliport-{place.replace(' ', '-')}.gif",
-            gif=film(truth, seen),
-            panels=("real", "ours"),
-            title=asked.text,
-            caption=f"{self.caption}{ends}; {name}",
-            badge=place,
-        )
+def block_ends(truth: Episode, seen: Seen) -> str:
+    """How far off, for the caption of a film."""
+    off = misses(seen.labels, truth, Instruction.parse(truth.instruction))
+    return "" if off is None else f"; block ends {100 * off[-1]:.1f} cm off"
 
 
 def models(run: Run) -> tuple[Model, ...]:
@@ -306,12 +280,12 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """Films of the episodes that look best and worst over the whole episode."""
     metric, (episodes, _) = run.measures.main, run.prepared
     values = [figures["ours", "episode", metric] for _, figures in found["episodes"]]
-    films: Any = [
-        Film(source, run.args.seed, f"{METRICS[metric]} {value:.3f}")
-        for source, value in zip(episodes, values, strict=True)
-    ]
-    badness = [-value if metric == "ssim" else value for value in values]
-    return {"films": extreme_clips(films, badness, run.sizes.clips)}
+    films = []
+    for source, value in zip(episodes, values, strict=True):
+        name = f"{source.split}, seed {source.seed}" if isinstance(source, StudyScene) else source.name
+        caption = f"{METRICS[metric]} {value:.3f}; {name}"
+        films.append(Film("cliport", partial(read, source), run.args.seed, caption, block_ends))
+    return {"films": extreme_clips(films, [*map(run.measures.badness, values)], run.sizes.clips)}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -349,21 +323,13 @@ def headline(run: Run) -> dict[str, Key]:
 # --- tables and page --------------------------------------------------------------------------------------------------
 
 
-def _columns(*metrics: str) -> list[Column]:
-    names = {**METRICS, "iou": "mask IoU", "ari": "FG-ARI"}
-    return [
-        Column(f"{names[m]} {v.removesuffix(' frames')}", ALL, v, m, 2 if m == "psnr" else 3)
-        for v, m in product(VARIANTS, metrics)
-    ]
-
-
 SUCCESS = [Column(f"success, {sentence}", ALL, sentence, "success") for sentence in SENTENCES]
 FRAMES = TableSpec(
-    "Frames", _columns("psnr", "ssim", "lpips"), list(LINES.values()),
+    "Frames", length_columns(ALL, VARIANTS, ("psnr", "ssim", "lpips")), list(LINES.values()),
     "PSNR, SSIM: higher is better; LPIPS (AlexNet): lower.",
 )  # fmt: skip
 MASKS = TableSpec(
-    "Masks, and predicted success", [*_columns("iou", "ari"), *SUCCESS], list(LINES.values()),
+    "Masks, and predicted success", [*length_columns(ALL, VARIANTS, ("iou", "ari")), *SUCCESS], list(LINES.values()),
     "Masks: slots are matched to objects afresh in every frame (Hungarian); no visible object is left out.",
 )  # fmt: skip
 LOOP = TableSpec(
@@ -417,13 +383,6 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     return [*sections, Section("What is absent", " ".join(absent) or "Nothing.")]
 
 
-def measures(args: Args) -> Measures:
-    """LPIPS beside PSNR and SSIM. ST-LPIPS, at full resolution, would take minutes an episode here."""
-    found = available_measures()
-    reasons = tuple(one for one in found.reasons if one[0] == "lpips")
-    return Measures(tuple(m for m in found.perceptual if m == "lpips"), reasons=reasons)
-
-
 STUDY = Study(
     name="cliport",
     title="CLIPort's own episodes",
@@ -431,7 +390,7 @@ STUDY = Study(
     args=Args,
     sizes=Sizes.of,
     methods=[line.key for line in MEASURED],
-    measures=measures,
+    measures=lambda args: available_measures(["lpips"]),  # ST-LPIPS would take minutes an episode here
     prepare=prepare,
     inputs=inputs,
     units=units,

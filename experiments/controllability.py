@@ -11,9 +11,6 @@ best, its motion is carried out in PyBullet, and the simulator alone judges. Wri
 `timings.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -25,8 +22,8 @@ from experiments.report.plots import curve_plot, plot_table
 from experiments.report.results import EpisodeLine, Results
 from experiments.report.rows import Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
-from experiments.study.clips import PredictionClip, episode_clips
-from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds
+from experiments.study.clips import PredictionClip, episode_clips, extremes_by_scene
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds, timings
 from experiments.study.judge import Verdicts, find_things, first_frame, judge, stack, trace
 from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
@@ -178,22 +175,16 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 
 def predicted_clips(outcomes: Sequence[PredictedOutcome], seed: int, count: int) -> list[PredictionClip]:
     """The `count` best and `count` worst cases of the first slot seed, each of another scene."""
-    found = []
+    clips, badness = [], []
     for outcome in outcomes:
         ours = outcome.verdicts["ours"]
         pairs = zip(ours.success_SV[0].tolist(), ours.miss_SV[0].tolist(), strict=True)
-        found += [(success, miss, outcome.scene, v) for v, (success, miss) in enumerate(pairs)]
-    clips = []
-    for best in (True, False):
-        firsts: dict[int, tuple[bool, float, StudyScene, int]] = {}
-        for case in sorted(found, key=lambda c: (not c[0], c[1]) if best else (c[0], -c[1])):
-            firsts.setdefault(case[2].seed, case)
-        for rank, (success, miss, scene, v) in enumerate(list(firsts.values())[:count], start=1):
+        for v, (success, miss) in enumerate(pairs):
             ends = f"block ends {miss:.1f} px from the bowl's centre" if np.isfinite(miss) else "not found"
             caption = f"{'original' if v == 0 else f'variant {v}'}; {ends}"
-            clip = PredictionClip(scene, (), seed, "predicted", caption, success, v, VARIANTS, best, rank)
-            clips.append(clip)
-    return clips
+            clips.append(PredictionClip(outcome.scene, (), seed, "predicted", caption, success, v, VARIANTS))
+            badness.append((not success, miss))
+    return extremes_by_scene(clips, badness, count)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -407,10 +398,7 @@ STUDY = Study(
     first=(
         "predicted_original", "predicted_variants_mean", "closed_loop_original", "closed_loop_variants_mean",
     ),
-    # Times are not in results.json, which must come out the same when a study is repeated.
-    files=lambda run, found: {
-        "timings.json": json.dumps(planning_seconds(_loop(found), column_of), indent=2) + "\n"
-    },
+    files=lambda run, found: timings(_loop(found), column_of),
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -15,12 +15,10 @@ outcome in one step then foresees by whole films. Writes `results.json`, `timing
 into `--out`.
 """
 
-from __future__ import annotations
-
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 from statistics import fmean
 from time import perf_counter
@@ -37,10 +35,11 @@ from envs.tasks.rearrange import FAMILIES
 from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.plots import plot_table
-from experiments.report.results import EpisodeLine, Results
+from experiments.report.results import Results
 from experiments.report.rows import Key, Row, by_key, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import tone
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome, timings
 from experiments.study.foresight import (
     BUDGETS,
     CASES,
@@ -56,7 +55,7 @@ from experiments.study.foresight import (
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import to_uint8
 from experiments.study.run import Found, Part, Run, Study, StudyArgs, UsageError, start
-from experiments.study.scenes import SCENES_PER_SEED, StudyScene, scene_hash
+from experiments.study.scenes import SCENES_PER_SEED, StudyScene
 from planning import (
     AnyGoal,
     AppearanceGrounder,
@@ -71,7 +70,7 @@ from planning import (
 )
 from planning.search import HORIZON
 from textocvp.checkpoint import WEIGHTS_FILE
-from textocvp.protocols import LoadCheckpoint, LoadModel
+from textocvp.protocols import LoadCheckpoint
 
 FIRST, APART = 5_000, 500  # seeds of the test split that no other study uses: so many for each family
 OUTCOMES = "outcomes"  # the part of sentences whose ends are foreseen
@@ -128,37 +127,17 @@ QUICK, DEFAULT = Sizes(4, 12, 4), Sizes(60, 100, 12)
 
 
 @dataclass(frozen=True)
-class Played:
-    """What came of an episode."""
-
-    episode: Episode
-    goal: str
-    success: bool  # the simulator's verdict after the last action
-    believes_reached: bool | None
-    said: tuple[str, ...]
-    seconds: tuple[float, ...]  # of each plan
-    error: str | None = None
-
-    @property
-    def lines(self) -> list[EpisodeLine]:
-        """For `results.json`."""
-        of, scene = self.episode, self.episode.scene
-        place = of.method, of.family, SUCCESS, scene_hash(scene), scene.seed
-        return [EpisodeLine(*place, self.goal, float(self.success), self.said, self.error)]
-
-
-@dataclass(frozen=True)
-class Episode:
+class Episode(LoopEpisode):
     """A unit of work: one searcher, one scene."""
 
-    method: str
-    scene: StudyScene
-    seed: int
-    load: LoadModel | None = None  # makes the world model; by default the study's own
+    @property
+    def who(self) -> str:
+        """The line; each training seed has its own."""
+        return self.method
 
     @property
-    def family(self) -> str:
-        """Of the scene."""
+    def place(self) -> str:
+        """The family of the scene."""
         return str(dict(self.scene.options)["family"])
 
     @property
@@ -166,23 +145,21 @@ class Episode:
         """Who acts."""
         return {**LINES, **CURVE}[self.method if self.load is None else OURS]
 
-    def run(self, worker: Worker) -> Played:
+    def run(self, worker: Worker) -> LoopOutcome:
         """Play it."""
         env = worker.environment(self.scene, record=False)
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         goal = info["instruction"]
         if self.searcher.plan is None:
             said, expert, base = [], Expert(env), cast(TabletopEnv, env.unwrapped)
-            for pair in expert.search()[: ATTEMPTS[self.family]]:
+            for pair in expert.search()[: ATTEMPTS[self.place]]:
                 said.append(base.task.scene(base.scene.objects, (pair,)).instruction)
                 info = env.step(expert.primitive(pair))[4]
-            return Played(self, goal, bool(info["is_success"]), None, tuple(said), ())
-        result = self.pursue(worker, env, goal_of(observation, info))
-        texts = tuple(attempt.instruction.text for attempt in result.attempts)
-        seconds = tuple(attempt.plan.seconds for attempt in result.attempts)
-        return Played(self, goal, result.success, result.believes_reached, texts, seconds, result.error)
+            return LoopOutcome(self, goal, bool(info["is_success"]), 0.0, None, tuple(said))
+        result = self.search(worker, env, goal_of(observation, info))
+        return LoopOutcome.of(self, goal, result)
 
-    def pursue(self, worker: Worker, env: gym.Env[Any, Any], goal: AnyGoal) -> EpisodeResult:
+    def search(self, worker: Worker, env: gym.Env[Any, Any], goal: AnyGoal) -> EpisodeResult:
         """Plan and act; see `run_episode`."""
         searcher = self.searcher
         assert searcher.plan is not None
@@ -195,7 +172,7 @@ class Episode:
             controller=LiteralController,
             seed=self.scene.seed,
             options=dict(self.scene.options),
-            max_actions=ATTEMPTS[self.family],
+            max_actions=ATTEMPTS[self.place],
         )
 
 
@@ -210,12 +187,12 @@ def goal_of(observation: Mapping[str, Any], info: Mapping[str, Any]) -> AnyGoal:
 class ConsequenceClip:
     """A unit of work: the film of the obvious sentence as imagined, beside what ours does and what the camera sees."""
 
-    played: Played
+    played: LoopOutcome
     rank: int
 
     def run(self, worker: Worker) -> Clip:
         """Play it once more, and imagine both films."""
-        episode = self.played.episode
+        episode = cast(Episode, self.played.episode)
         env = worker.environment(episode.scene)
         observation, info = env.reset(seed=episode.scene.seed, options=dict(episode.scene.options))
         goal, model = goal_of(observation, info), worker.world_model
@@ -226,21 +203,21 @@ class ConsequenceClip:
             first = to_uint8(model.rollout(observation["rgb"], goal.instructions[0].text, horizon=horizon).frames[0])
         else:
             first = goal.rgb[None]
-        result = episode.pursue(worker, env, goal)
+        result = episode.search(worker, env, goal)
         taken = [model.rollout(one.rgb, one.instruction.text, horizon=horizon) for one in result.attempts]
         films = [
             first,
             np.concatenate([to_uint8(one.frames[0]) for one in taken] or [result.frames[:1]]),
             result.frames,
         ]
-        said = "; ".join(text.removeprefix("put ") for text in self.played.said) or "nothing"
+        said = "; ".join(text.removeprefix("put ") for text in self.played.instructions) or "nothing"
         scale = 2 if episode.scene.image_size == CLOSE_SIDE else 1
         return Clip(
             name=f"imagination-{self.rank}.gif",
             gif=gif([[film[::2] for film in films]], seconds_a_frame=0.2, scale=scale),
             panels=("the goal, said at once" if said_at_once else "the goal", "the plan", "what happened"),
-            title=self.played.goal,
-            caption=f"{episode.family}, seed {episode.scene.seed}; said: {said}",
+            title=self.played.text,
+            caption=f"{episode.place}, seed {episode.scene.seed}; said: {said}",
             badge="success" if result.success else "failure",
             tone=tone(result.success),
         )
@@ -270,7 +247,8 @@ def units(run: Run) -> dict[str, Part]:
         scenes = [family_scene(family, first + i, *ground) for i in range(run.sizes.scenes)]
         asked = [*LINES.values(), *(CURVE.values() if family in CURVE_FAMILIES else ())]
         keys = [one.key for one in asked if one.pictures or family != "picture"] + [*others]
-        parts[family] = Part([Episode(key, scene, seed, others.get(key)) for scene in scenes for key in keys], 0.7)
+        episodes = [Episode(key, scene, seed=seed, load=others.get(key)) for scene in scenes for key in keys]
+        parts[family] = Part(episodes, 0.7)
     first, names = SCENES_PER_SEED * seed + FIRST_OUTCOME, list(FAMILIES)
     scenes = [family_scene(names[i % len(names)], first + i, *ground) for i in range(run.sizes.outcomes)]
     foreseen = [Foresight(scene, seed, key, others.get(key)) for scene in scenes for key in (OURS, *others)]
@@ -298,7 +276,7 @@ def rows(run: Run, found: Found) -> list[Row]:
         if not here:
             continue
         made.append(rate_row(key, "test", family, SUCCESS, [one.success for one in here]))
-        made.append(mean_row(key, "test", family, "sentences", [len(one.said) for one in here]))
+        made.append(mean_row(key, "test", family, "sentences", [one.steps for one in here]))
         if key not in ("simulator", "random"):
             beliefs = [one.believes_reached != one.success for one in here]
             made.append(rate_row(key, "test", family, "wrong_belief", beliefs))
@@ -385,16 +363,6 @@ BUDGET = TableSpec(
 )
 
 
-def seconds(found: Found) -> dict[str, dict[str, float]]:
-    """Mean seconds of a plan, line -> family -> seconds. Not in results.json, which must come out the same again."""
-    table: dict[str, dict[str, float]] = {}
-    for family, key in product(FAMILIES, LINES):
-        its = [s for one in found[family] if one.episode.method == key for s in one.seconds]
-        if its:
-            table.setdefault(key, {})[family] = round(float(np.mean(its)), 3)
-    return table
-
-
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     figures, (look, side) = list(results.rows), ground_of(run)
@@ -462,7 +430,7 @@ STUDY = Study(
     ],
     headline=HEADLINE,
     first=("plain", "occupied", "covered", "swap", "tower", "picture"),
-    files=lambda run, found: {"timings.json": json.dumps(seconds(found), indent=2) + "\n"},
+    files=lambda run, found: timings([one for family in FAMILIES for one in found[family]], attrgetter("place")),
 )
 
 if __name__ == "__main__":

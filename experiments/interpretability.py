@@ -11,10 +11,8 @@ the same slots under a sentence that names something else, and the model with it
 because that term alone could decide. Writes `results.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -38,7 +36,7 @@ from experiments.study.attention import (
     read_attention,
     without_color_term,
 )
-from experiments.study.clips import tone
+from experiments.study.clips import extremes_by_scene, tone
 from experiments.study.judge import find_things
 from experiments.study.pool import Worker
 from experiments.study.predictions import to_uint8
@@ -219,14 +217,7 @@ def extreme_cases(outcomes: Sequence[AttentionOutcome], seed: int, count: int) -
         for o in outcomes
         for v, one in enumerate(o.readings[OURS])
     ]  # fmt: skip
-    chosen = []
-    for best in (True, False):
-        firsts: dict[int, AttentionPicture] = {}
-        for case in sorted(every, key=lambda case: case.lead, reverse=best):
-            firsts.setdefault(case.scene.seed, case)
-        ranked = enumerate(list(firsts.values())[:count], start=1)
-        chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
-    return chosen
+    return extremes_by_scene(every, [-case.lead for case in every], count)
 
 
 def headline(run: Run) -> dict[str, Key]:

@@ -11,9 +11,6 @@ shows what carrying out alone achieves; random steps; and the scripted expert. T
 Writes `results.json`, `timings.json`, `report.html`, plots and clips into `--out`.
 """
 
-from __future__ import annotations
-
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -29,7 +26,7 @@ from experiments.report.results import Results
 from experiments.report.rows import Row, mean_row, rate_row
 from experiments.report.tables import Cell, Column, Line, TableSpec, columns
 from experiments.study.clips import episode_clips
-from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds
+from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds, timings
 from experiments.study.methods import HORIZON, METHODS, PLANNERS, MakePlanner, Method
 from experiments.study.pool import Unit
 from experiments.study.run import Found, FullArgs, Part, Run, Study, start
@@ -164,10 +161,14 @@ def units(run: Run) -> dict[str, Part]:
     return {**parts, "clips": Part(seconds=4.0, count=2 * run.sizes.clips)}
 
 
+def outcomes_of(found: Found) -> list[LoopOutcome]:
+    """Of all columns."""
+    return [o for title in PLACES for o in found[title]]
+
+
 def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
     """Episodes of ours."""
-    outcomes = [o for title in PLACES for o in found[title]]
-    return {"clips": episode_clips(outcomes, lambda e: f"{column_of(e)}, {e.method}", run.sizes.clips, OURS)}
+    return {"clips": episode_clips(outcomes_of(found), lambda e: f"{column_of(e)}, {e.method}", run.sizes.clips, OURS)}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -234,15 +235,10 @@ PLOTTED = [
 ]  # fmt: skip
 
 
-def seconds(found: Found) -> dict[str, dict[str, float]]:
-    """Mean planning seconds, line -> column -> seconds."""
-    return planning_seconds([o for title in PLACES for o in found[title]], column_of)
-
-
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     figures = list(results.rows)
-    for title, value in seconds(found).get(OURS[0], {}).items():
+    for title, value in planning_seconds(outcomes_of(found), column_of).get(OURS[0], {}).items():
         figures.append(Row(OURS[0], *COLUMNS[title], "seconds", value, value, value, 1))
     caption = "Dots with 95 % intervals over scenes; all but the first carry out one plan."
     success = plot_table("success.png", GOALS, figures, label="whole goal reached", caption=caption, lines=PLOTTED)
@@ -304,7 +300,7 @@ STUDY = Study(
         "closed_loop_two_steps", "closed_loop_three_steps", "closed_loop_bowl_taken",
         "closed_loop_one_plan_three_steps",
     ),
-    files=lambda run, found: {"timings.json": json.dumps(seconds(found), indent=2) + "\n"},
+    files=lambda run, found: timings(outcomes_of(found), column_of),
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ the named block and the arm alone. `copy seed` is what standing still earns, `wr
 earns, `true frames` what this parser can earn at best. Writes `results.json`, `report.html`, plots and clips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -9,8 +9,6 @@ moving the wrong thing earns, `true frames` what this renderer can earn at best.
 JEDi those of V-JEPA 2; without them the report says what to fetch. Writes `results.json`, `report.html`, plots, clips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -95,8 +93,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
         PredictionClip(scene, shown, seed, "prediction", f"{METRICS[metric]} {mean:.3f}")
         for scene, mean in zip(study_scenes(SPLIT, len(means), seed), means, strict=True)
     ]
-    badness = [-mean if metric == "ssim" else mean for mean in means]
-    return {"clips": extreme_clips(clips, badness, run.sizes.clips)}
+    return {"clips": extreme_clips(clips, [*map(run.measures.badness, means)], run.sizes.clips)}
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -234,7 +231,9 @@ STUDY = Study(
     args=Args,
     sizes=lambda args: replace(s := QUICK if args.quick else DEFAULT, scenes=args.scenes or s.scenes),
     methods=IMAGINING,
-    measures=lambda args: available(None if args.quick else args.jedi, LENGTHS, "a quick run leaves it out"),
+    measures=lambda args: available(
+        jedi=None if args.quick else args.jedi, jedi_lengths=LENGTHS, without_jedi="a quick run leaves it out"
+    ),
     units=units,
     cases=cases,
     rows=lambda run, found: [*frame_rows(found["scenes"]), *jedi_rows(found["scenes"])],

@@ -9,8 +9,6 @@ baselines and controls. The first table holds the bars: closed-loop success, and
 weights of AlexNet are not there) smaller than MAGE's. Writes `results.json`, `report.html`, plots and clips.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -34,6 +32,7 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from experiments.study.scenes import StudyScene, place_of, scene_hash, study_scenes
+from experiments.study.wordings import FREE
 from planning import AppearanceGrounder
 from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
@@ -175,7 +174,7 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
             caption = f"{SPLITS[one.scene.split]}; {METRICS[metric]} {mean:.3f}"
             clips.append(PredictionClip(one.scene, run.models, run.args.seed, "robustness", caption, good))
             # A failure is worse than any success; the metrics stay well below 1.
-            badness.append((-mean if metric == "ssim" else mean) + (10.0 if good is False else 0.0))
+            badness.append(run.measures.badness(mean) + (10.0 if good is False else 0.0))
     episodes = episode_clips(found["closed loop"], lambda e: SPLITS[e.scene.split], run.sizes.acted // 2)
     return {"imagined clips": extreme_clips(clips, badness, run.sizes.clips), "robot clips": episodes}
 
@@ -433,6 +432,7 @@ STUDY = Study(
     horizon=HORIZON,
     methods=(*IMAGINING, *ACTING),
     measures=lambda args: available(),
+    inputs=lambda args: [FREE],
     units=units,
     cases=cases,
     rows=rows,

@@ -11,8 +11,6 @@ nothing else. Competitors take turns in every round, so ratios hold on a busy ma
 travel between machines. Writes `results.json` and `report.html` into `--out`.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,8 +29,7 @@ from experiments.study.pool import Worker
 from experiments.study.run import Found, Part, Run, Study, UsageError, start
 from experiments.study.scenes import SampledScene, StudyScene, sample_scene, study_scenes
 from experiments.study.timing import CORES, Work, machine_in_words, median_interval, race
-from planning import AppearanceGrounder, Instruction, measure_rollout, watched_frames
-from planning.scores import DEFAULT_CRITERION, DEFAULT_SCORE
+from planning import THRESHOLDS, AppearanceGrounder, Instruction, measure_rollout, score, succeeds, watched_frames
 from textocvp.baselines.mage import MageVideoModel
 from textocvp.config import ModelConfig
 from textocvp.metrics.intervals import Interval
@@ -221,7 +218,7 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
     assert isinstance(model, WorldModel)
     image_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
     goal, parsed = Instruction.parse(sampled.texts[0]), model.parse(image_1HW3)
-    frames = watched_frames(STEPS + 1, DEFAULT_CRITERION.thresholds.settle_frames, STRIDE)
+    frames = watched_frames(STEPS + 1, THRESHOLDS.settle_frames, STRIDE)
     allowed = ground(parsed).with_kinds(goal.things).instructions(goal.relation)
     texts = [allowed[i % len(allowed)].text for i in range(CANDIDATES)]
 
@@ -231,7 +228,7 @@ def planning_work(model: VideoModel, phase: Phase, sampled: SampledScene) -> Wor
         grounding = ground(parsed).with_kinds(goal.things)
         rollout = model.rollout(parsed, texts, horizon=STEPS)
         trace = measure_rollout(rollout, grounding, goal, frames=frames)
-        return DEFAULT_SCORE(trace), DEFAULT_CRITERION(trace)
+        return score(trace), succeeds(trace)
 
     rollout = model.rollout(parsed, texts, horizon=STEPS)
     return {

@@ -9,8 +9,6 @@ it afterwards. Stop at any moment and start again: finished runs are skipped, an
 The episodes are parsed once, and all predictor runs share those slots.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

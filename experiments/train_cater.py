@@ -9,8 +9,6 @@ Each step is a command that can also be typed. Steps that need nothing of each o
 at any moment and start again: finished steps are skipped, an unfinished one goes on where it was.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess
@@ -126,15 +124,7 @@ def steps(args: Args) -> list[Step]:
 
     def slots(name: str, parser: str) -> Step:
         checkpoint = f"{out}/{parser}/checkpoint"
-        command = (
-            sys.executable,
-            __file__,
-            "--parse",
-            checkpoint,
-            str(out / name),
-            "--workers",
-            str(args.workers),
-        )
+        command = (sys.executable, __file__, "--parse", checkpoint, str(out / name), "--workers", str(args.workers))
         return Step(name, (*command, "--out", str(out)), out / name / DONE, ("train", "val", parser))
 
     reads = ("--workers", {"toy": "0", "cpu": "1", "gpu": "4"}[args.scale])

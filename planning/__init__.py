@@ -10,7 +10,7 @@ Scoring rollouts without a robot:
     instruction = Instruction.parse(text)
     rollout = world_model.rollout(obs, [text] * n)
     grounding = AppearanceGrounder.from_info(info)(rollout)
-    success_B = SuccessCriterion()(measure_rollout(rollout, grounding, instruction))
+    success_B = succeeds(measure_rollout(rollout, grounding, instruction))
 
 Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """
@@ -31,19 +31,7 @@ from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
 from .loop import Attempt, EpisodeResult, run_episode
 from .planners import BeamPlanner, Candidate, Imagines, Plan, Planner, RandomPlanner, observe, watched_frames
 from .relations import RELATIONS, THRESHOLDS, Relation, Thresholds
-from .scores import (
-    DEFAULT_CRITERION,
-    DEFAULT_SCORE,
-    CarryScore,
-    PlacementScore,
-    Score,
-    SuccessCriterion,
-    Trace,
-    WeightedSum,
-    measure,
-    measure_rollout,
-    unmet,
-)
+from .scores import Trace, measure, measure_rollout, score, succeeds, unmet
 from .search import (
     AnySentencePlanner,
     BelievingPlanner,
@@ -59,12 +47,11 @@ InstructionPlanner = BeamPlanner
 """What the planner of goals of one instruction was called when it stood alone: programs of users say it."""
 
 __all__ = [
-    "DEFAULT_CRITERION", "DEFAULT_SCORE", "RELATIONS", "THRESHOLDS", "AnyGoal", "AnySentencePlanner",
-    "AppearanceGrounder", "Attempt", "BeamPlanner", "BelievingPlanner", "Candidate", "CarryScore", "Controller",
-    "EpisodeResult", "Foresees", "Goal", "Grounder", "Grounding", "GroundingError", "Imagines", "Instruction",
-    "InstructionPlanner", "LiteralController", "LiteralPlanner", "Palette", "PickAndPlace", "PictureGoal",
-    "PinholeCamera", "PlacementScore", "Plan", "Planner", "RandomPlanner", "Relation", "Score", "SearchPlanner",
-    "SegmentationGrounder", "SuccessCriterion", "Thing", "Thresholds", "Trace", "View", "Wanted", "WeightedSum",
-    "ground", "ground_by_segmentation", "measure", "measure_rollout", "observe", "places", "run_episode",
-    "seen_supports", "unmet", "watched_frames",
+    "RELATIONS", "THRESHOLDS", "AnyGoal", "AnySentencePlanner", "AppearanceGrounder", "Attempt", "BeamPlanner",
+    "BelievingPlanner", "Candidate", "Controller", "EpisodeResult", "Foresees", "Goal", "Grounder", "Grounding",
+    "GroundingError", "Imagines", "Instruction", "InstructionPlanner", "LiteralController", "LiteralPlanner", "Palette",
+    "PickAndPlace", "PictureGoal", "PinholeCamera", "Plan", "Planner", "RandomPlanner", "Relation", "SearchPlanner",
+    "SegmentationGrounder", "Thing", "Thresholds", "Trace", "View", "Wanted", "ground", "ground_by_segmentation",
+    "measure", "measure_rollout", "observe", "places", "run_episode", "score", "seen_supports", "succeeds", "unmet",
+    "watched_frames",
 ]  # fmt: skip

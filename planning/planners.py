@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from .grounding import Grounder, Grounding, GroundingError
 from .language import AnyGoal, Goal, Instruction
-from .relations import RELATIONS
-from .scores import DEFAULT_CRITERION, DEFAULT_SCORE, Score, SuccessCriterion, Trace, measure_rollout, unmet
+from .relations import RELATIONS, THRESHOLDS
+from .scores import Trace, measure_rollout, score, succeeds, unmet
 
 if TYPE_CHECKING:
     from textocvp.rollout import Rollout
@@ -36,7 +36,7 @@ class Candidate:
 
     instructions: tuple[Instruction, ...]  # in the order in which they would be carried out
     score: float  # of the goal at its imagined end, higher is better
-    reaches_goal: bool  # whether the criterion says so of what was imagined
+    reaches_goal: bool  # whether what was imagined `succeeds`
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,6 @@ class BeamPlanner(_LooksAtMasks):
     """
 
     world_model: Imagines
-    score: Score = DEFAULT_SCORE  # ranks a course against one instruction of the goal
-    criterion: SuccessCriterion = DEFAULT_CRITERION  # says whether it fulfils that instruction
     depth: int | None = None  # instructions in a plan; at most, and by default, as many as do not hold yet
     candidates: Literal["goal", "scene"] = "goal"  # move a thing of the goal, or any thing of the scene
     beam: int = 4  # sequences that are kept after each step; 0 keeps all (exhaustive)
@@ -146,7 +144,7 @@ class BeamPlanner(_LooksAtMasks):
             starts = starts.select(rows)
             rollout = self.world_model.rollout(starts, texts, horizon=self.horizon, seed=self.seed)
             length = rollout.slots.shape[1]
-            frames = watched_frames(length, self.criterion.thresholds.settle_frames, self.stride)
+            frames = watched_frames(length, THRESHOLDS.settle_frames, self.stride)
             new = [measure_rollout(rollout, grounding, want, frames=frames) for want in wanted]
             parents = [kept[row] for row in rows]
             if done:
@@ -157,22 +155,23 @@ class BeamPlanner(_LooksAtMasks):
                 _Branch((*branches[p].instructions, one), (*branches[p].imagined, (rollout, i)))
                 for i, (p, (_, one)) in enumerate(zip(parents, steps, strict=True))
             ]
-            scores = self._scores(traces, depth)
+            scores = _scores(traces, depth)
             ranked = sorted(range(len(steps)), key=lambda i: scores[i], reverse=True)
             kept = ranked[: self.beam] if self.beam else ranked
             starts = rollout.last.select(kept)
 
-        reaches_B = torch.stack([self.criterion(trace) for trace in traces]).sum(0) >= depth
+        reaches_B = torch.stack([succeeds(trace) for trace in traces]).sum(0) >= depth
         ranking = tuple(Candidate(branches[i].instructions, scores[i], bool(reaches_B[i])) for i in ranked)
         rollouts = tuple(batch.select(row) for batch, row in branches[ranked[0]].imagined)
         return Plan(ranking, rollouts, grounding, perf_counter() - began)
 
-    def _scores(self, traces: Sequence[Trace], count: int) -> list[float]:
-        """One score a sequence: the mean over the `count` instructions of the goal that it fulfils best."""
-        scores_Bn = torch.stack([self.score(trace) for trace in traces], dim=1).tolist()
-        if count < len(traces):
-            scores_Bn = [sorted(scores_n, reverse=True)[:count] for scores_n in scores_Bn]
-        return [sum(scores_n) / count for scores_n in scores_Bn]
+
+def _scores(traces: Sequence[Trace], count: int) -> list[float]:
+    """One score a sequence: the mean over the `count` instructions of the goal that it fulfils best."""
+    scores_Bn = torch.stack([score(trace) for trace in traces], dim=1).tolist()
+    if count < len(traces):
+        scores_Bn = [sorted(scores_n, reverse=True)[:count] for scores_n in scores_Bn]
+    return [sum(scores_n) / count for scores_n in scores_Bn]
 
 
 @dataclass

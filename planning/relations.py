@@ -3,8 +3,6 @@
 To add one, add its entry to `RELATIONS`. Sentences are then parsed, planned, scored and carried out with it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,14 +1,14 @@
 """What masks say: whether instructions hold in a frame, and how well a rollout fulfils them.
 
 `unmet` looks at one frame. `measure` turns the masks of a rollout into a `Trace` of two distances a frame. From that
-`SuccessCriterion` tells whether the instruction was carried out, and a `Score` ranks candidates.
+`succeeds` tells whether the instruction was carried out, and `score` ranks candidates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -163,72 +163,30 @@ def measure_rollout(
     )
 
 
-@dataclass(frozen=True)
-class SuccessCriterion:
-    """Says of each rollout of a trace whether the instruction was carried out (paper, section 4.4).
+def succeeds(trace: Trace, limits: Thresholds = THRESHOLDS) -> Tensor:
+    """Whether each rollout of a trace carried the instruction out, (B,) bool (paper, section 4.4).
 
-    It was if the arm stays at the thing for some frames in a row, and the thing ends as asked for. The thresholds are
+    It did if the arm stays at the thing for some frames in a row, and the thing ends as asked for. The thresholds are
     calibrated for traces of every frame.
     """
-
-    thresholds: Thresholds = THRESHOLDS
-
-    def __call__(self, trace: Trace) -> Tensor:
-        """Success, (B,) bool."""
-        limits = self.thresholds
-        settled_Bt = trace.distance_Bt[:, -limits.settle_frames :] <= trace.within_B[:, None]
-        return (trace.longest_contact(limits.contact_px) >= limits.contact_frames) & settled_Bt.all(1)
+    settled_Bt = trace.distance_Bt[:, -limits.settle_frames :] <= trace.within_B[:, None]
+    return (trace.longest_contact(limits.contact_px) >= limits.contact_frames) & settled_Bt.all(1)
 
 
-class Score(Protocol):
-    """Ranks rollouts."""
+def placement_score(trace: Trace, limits: Thresholds = THRESHOLDS) -> Tensor:
+    """How near the relation is at the end (B,): 1 at distance 0, 0 at the limit of success, and down to -10 beyond.
 
-    def __call__(self, trace: Trace) -> Tensor:
-        """One score a rollout, (B,); higher is better, 1 is as good as it gets."""
-
-
-@dataclass(frozen=True)
-class PlacementScore:
-    """How near the relation is at the end: 1 at distance 0, 0 at the limit of success, negative beyond."""
-
-    thresholds: Thresholds = THRESHOLDS
-
-    def __call__(self, trace: Trace) -> Tensor:
-        """The mean over the last `settle_frames` looked-at frames, (B,), at least -10."""
-        distance_Bt = trace.distance_Bt[:, -self.thresholds.settle_frames :]
-        return (1 - distance_Bt.mean(1) / trace.within_B).clamp(min=-10.0)
-
-
-@dataclass(frozen=True)
-class CarryScore:
-    """How long the arm holds the thing, as a share of `contact_frames`, at most 1."""
-
-    thresholds: Thresholds = THRESHOLDS
-
-    def __call__(self, trace: Trace) -> Tensor:
-        limits = self.thresholds
-        return (trace.longest_contact(limits.contact_px) / limits.contact_frames).clamp(max=1)
-
-
-@dataclass(frozen=True)
-class WeightedSum:
-    """The weighted mean of other scores.
-
-    Raises:
-        ValueError: if there are not as many weights, or their sum is not positive.
+    It is the mean over the last `settle_frames` looked-at frames.
     """
-
-    scores: tuple[Score, ...]
-    weights: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.scores) != len(self.weights) or sum(self.weights) <= 0:
-            raise ValueError(f"{len(self.scores)} scores need as many weights with a positive sum: {self.weights}")
-
-    def __call__(self, trace: Trace) -> Tensor:
-        parts = [weight * score(trace) for score, weight in zip(self.scores, self.weights, strict=True)]
-        return torch.stack(parts).sum(0) / sum(self.weights)
+    distance_Bt = trace.distance_Bt[:, -limits.settle_frames :]
+    return (1 - distance_Bt.mean(1) / trace.within_B).clamp(min=-10.0)
 
 
-DEFAULT_CRITERION = SuccessCriterion()
-DEFAULT_SCORE = WeightedSum((PlacementScore(), CarryScore()), (0.8, 0.2))
+def carry_score(trace: Trace, limits: Thresholds = THRESHOLDS) -> Tensor:
+    """How long the arm holds the thing (B,), as a share of `contact_frames`, at most 1."""
+    return (trace.longest_contact(limits.contact_px) / limits.contact_frames).clamp(max=1)
+
+
+def score(trace: Trace) -> Tensor:
+    """What ranks rollouts (B,): higher is better, 1 is as good as it gets."""
+    return 0.8 * placement_score(trace) + 0.2 * carry_score(trace)

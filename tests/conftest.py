@@ -15,11 +15,7 @@ from pathlib import Path
 import pytest
 
 NEEDS_PYBULLET = re.compile(r"^(from|import) (envs|experiments|pybullet)\b", re.MULTILINE)
-SHARED = (
-    b"loky",
-    b"resource_tracker",
-    b"forkserver",
-)  # joblib's and multiprocessing's own, used again by later tests
+SHARED = (b"loky", b"resource_tracker", b"forkserver")  # joblib's and multiprocessing's own, used again by later tests
 POOL = "ExecutorManagerThread"  # joblib's
 SECONDS = 5.0  # for what is just ending
 

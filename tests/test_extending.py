@@ -37,13 +37,7 @@ from textocvp.training import parser, predictor
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 TABLES = (TASKS, SPLITS, RELATIONS, FORMATS, PARSERS, ENCODERS, PREDICTORS, METHODS, BASELINES, PRESETS)
-SMALL = (
-    "parser.image_size=32",
-    "predictor.layers=1",
-    "predictor.dim=16",
-    "predictor.heads=2",
-    "predictor.hidden=16",
-)
+SMALL = ("parser.image_size=32", "predictor.layers=1", "predictor.dim=16", "predictor.heads=2", "predictor.hidden=16")
 
 
 @pytest.fixture(autouse=True)
@@ -107,11 +101,7 @@ def train_both(folder: Path, data: Path, *settings: str, preset: str = "tabletop
     changes = (*SMALL, *settings)
     parser.train(parser.ParserTraining(out=folder / "parser", preset=preset, clip=2, set=changes, **common))
     later = [change for change in changes if change.startswith(("predictor.", "text."))]
-    stage2 = dict(
-        parser=str(folder / "parser" / "checkpoint"),
-        horizon=2,
-        set=later,
-    )
+    stage2 = dict(parser=str(folder / "parser" / "checkpoint"), horizon=2, set=later)
     predictor.train(predictor.PredictorTraining(out=folder / "predictor", **stage2, **common))
     return WorldModel.from_pretrained(folder / "predictor" / "checkpoint")
 

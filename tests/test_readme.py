@@ -77,8 +77,7 @@ def test_only_languages_that_are_run() -> None:
 
 
 @pytest.mark.skipif(
-    DEFAULT_CHECKPOINT not in bundled_checkpoints(),
-    reason=f"the checkpoint {DEFAULT_CHECKPOINT} is not there yet",
+    DEFAULT_CHECKPOINT not in bundled_checkpoints(), reason=f"the checkpoint {DEFAULT_CHECKPOINT} is not there yet"
 )
 def test_every_snippet_runs(clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(clone)

@@ -54,9 +54,7 @@ def job(tmp_path: Path):
         slurm = {"SLURM_JOB_ID": "20007", "SLURM_JOB_NODELIST": "first,second"}
         path = {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
         return subprocess.Popen(
-            ["bash", str(SCRIPT), *arguments],
-            cwd=tmp_path,
-            env={**os.environ, **path, **slurm, **environment},
+            ["bash", str(SCRIPT), *arguments], cwd=tmp_path, env={**os.environ, **path, **slurm, **environment}
         )
 
     return start

@@ -7,8 +7,6 @@ The environments and the planner are installed as `textocvp.envs` and `textocvp.
 folders ``envs/`` and ``planning/`` beside this one, with both names: use one of the two in a program.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 

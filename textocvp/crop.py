@@ -4,8 +4,6 @@ In its own coordinates a thing looks the same wherever it stands (Invariant Slot
 are two small matrix products (DRAW, Gregor et al. 2015) and differentiable in place and size.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Files that replace others: whatever happens, the old one or the new one is there whole."""
 
-from __future__ import annotations
-
 import io
 import os
 import uuid

@@ -3,8 +3,6 @@
 Shape suffixes: B batch, N tokens that ask, M tokens that are asked, L words, C width, h heads, d width of a head.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import AbstractContextManager, nullcontext
 

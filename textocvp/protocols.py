@@ -4,8 +4,6 @@ A `VideoModel` imagines frames, with slots or without. A `SlotModel` also gives 
 Whatever has these methods is one, so a study that asks for no more also runs on a test double.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,17 +4,3 @@ from .captions import read_caption
 from .record import CaterConfig
 from .scenes import ACTIONS, Act, Action, Clip, Thing, cell, draw_acts, draw_clip
 from .world import Table
-
-__all__ = [
-    "ACTIONS",
-    "Act",
-    "Action",
-    "CaterConfig",
-    "Clip",
-    "Table",
-    "Thing",
-    "cell",
-    "draw_acts",
-    "draw_clip",
-    "read_caption",
-]

@@ -1,7 +1,5 @@
 """Captions read back: what the things of a scene would have to do for a caption to be true."""
 
-from __future__ import annotations
-
 import re
 from itertools import product
 

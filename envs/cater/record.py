@@ -1,7 +1,5 @@
 """Clips of CATER-hard for `envs.dataset`: what `python -m envs.collect --world cater` writes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -10,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dataset import ARRAYS, TEXT, Columns, versions
+from ..dataset import ARRAYS, TEXT, Arrays, Columns, World, versions
 from ..splits import SPLITS
 from .scenes import ACTIONS, COLORS, FRAMES, MATERIALS, SIZES, Clip, draw_clip
 from .world import Table
@@ -31,7 +29,7 @@ class RecordedClip:
 
 
 @dataclass(frozen=True)
-class CaterConfig:
+class CaterConfig(World):
     """What, beside the seed, decides the content of a clip.
 
     Attributes:
@@ -44,14 +42,11 @@ class CaterConfig:
     image_size: int = 64
     captions: Captions = "explicit"
     world: str = "cater"
-    sentences = 1
 
     def make(self) -> Table:
-        """What draws the clips."""
         return Table(self.image_size)
 
     def record(self, table: Table, numbers: range) -> Iterator[RecordedClip]:
-        """Clips of the split; a function of the configuration and the numbers alone."""
         for number in numbers:
             seed = SPLITS[self.split].seed(number)
             clip, jitter = clip_of(seed)
@@ -60,27 +55,16 @@ class CaterConfig:
             said = clip.instruction
             if self.captions == "ambiguous":
                 said = clip.ambiguous(np.random.default_rng([seed, 3]))
-            yield RecordedClip(
-                seed,
-                said,
-                clip,
-                {
-                    "frames": frames,
-                    "segmentation": labels,
-                    "object_position": np.stack([centers for centers, _ in poses]).astype(np.float32),
-                    "object_orientation": np.stack([turns for _, turns in poses]).astype(np.float32),
-                },
-            )
+            position, orientation = (np.stack(part).astype(np.float32) for part in zip(*poses, strict=True))
+            arrays: list[NDArray[Any]] = [frames, labels, position, orientation]
+            yield RecordedClip(seed, said, clip, dict(zip(self.arrays, arrays, strict=True)))
 
     @property
-    def arrays(self) -> dict[str, Any]:
-        """The data sets over frames."""
-        names = ("frames", "segmentation", "object_position", "object_orientation")
-        return {name: ARRAYS[name] for name in names}
+    def arrays(self) -> Arrays:
+        return {name: ARRAYS[name] for name in ("frames", "segmentation", "object_position", "object_orientation")}
 
     @property
     def columns(self) -> Columns:
-        """The data sets over episodes: type and value."""
         return {
             "length": ("i8", lambda recorded: FRAMES),
             "seed": ("i8", lambda recorded: recorded.seed),
@@ -91,7 +75,6 @@ class CaterConfig:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """The file's attributes, beside its format and configuration."""
         camera = Table(self.image_size).camera
         numbers = [str(n) for n in (-3, -2, -1, 1, 2, 3)]
         vocabulary = [*WORDS.split(), *SIZES, *MATERIALS, *COLORS, *ACTIONS, *numbers]
@@ -103,10 +86,6 @@ class CaterConfig:
             "camera_extrinsics": camera.extrinsics,
         }
 
-    def to_json(self) -> str:
-        """The configuration, by which files are compared."""
-        return json.dumps(asdict(self))
-
 
 def clip_of(seed: int) -> tuple[Clip, NDArray[np.float64]]:
     """The clip with this seed, and how far its light is off its place (3,)."""
@@ -116,13 +95,7 @@ def clip_of(seed: int) -> tuple[Clip, NDArray[np.float64]]:
 
 def _objects(clip: Clip) -> list[dict[str, Any]]:
     return [
-        {
-            "id": number,
-            "label": 1 + number,
-            "kind": thing.shape,
-            "color": thing.color,
-            "size": thing.size,
-            "material": thing.material,
-        }
+        {"id": number, "label": 1 + number, "kind": thing.shape}
+        | {name: getattr(thing, name) for name in ("color", "size", "material")}
         for number, thing in enumerate(clip.things)
     ]

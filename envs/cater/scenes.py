@@ -5,8 +5,6 @@ shapes, three sizes, two materials, eight colours, a table from -3 to 3 in x and
 Motion is kinematic: things do not touch each other, so nothing needs to be simulated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil, hypot, pi
@@ -245,11 +243,7 @@ def draw_times(rng: np.random.Generator) -> tuple[int, int]:
 
 
 def _draw_act(
-    rng: np.random.Generator,
-    things: tuple[Thing, ...],
-    number: int,
-    acting: Sequence[int],
-    action: Action | None,
+    rng: np.random.Generator, things: tuple[Thing, ...], number: int, acting: Sequence[int], action: Action | None
 ) -> Act | None:
     thing = things[number]
     start, stop = draw_times(rng)

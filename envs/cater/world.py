@@ -1,18 +1,17 @@
 """CATER's table in PyBullet: a clip's things as bodies without physics, drawn frame by frame."""
 
-from __future__ import annotations
-
 from functools import lru_cache
-from itertools import pairwise, product
-from math import cos, hypot, pi, sin
+from itertools import product
+from math import cos, pi, sin
 
 import numpy as np
 import pybullet as p
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
+from scipy.spatial import ConvexHull
 
 from ..physics.camera import Camera, CameraPreset
-from ..physics.shapes import Mesh
+from ..physics.shapes import Mesh, lathed
 from ..physics.simulation import Bullet
 from .scenes import EYE, FRAMES, Clip, Thing
 
@@ -103,7 +102,8 @@ class Table:
         for thing, center, turn in zip(self.clip.things, centers, turns, strict=True):
             points = _rotated(thing.radius * _outline(thing.shape), turn) + center
             points = points - np.maximum(points[:, 2:], 0) * (self.light / self.light[2])
-            draw.polygon(_hull(drawn.project(points)), fill=255)
+            shadow = drawn.project(points)
+            draw.polygon(shadow[ConvexHull(shadow).vertices].ravel().tolist(), fill=255)
         soft = np.asarray(picture.filter(ImageFilter.GaussianBlur(SOFT * size)), np.float32) / 255
         floor: NDArray[np.float32] = _empty_floor(size) * (1 - np.float32(SHADE) * soft)
         return floor
@@ -119,7 +119,7 @@ class Table:
             half = [r / 2**0.5] * 3
             shape = self.bullet.createVisualShape(p.GEOM_BOX, halfExtents=half, **look)
         else:
-            mesh = MESHES[thing.shape]()
+            mesh = MESHES[thing.shape]
             scaled = [[r * value for value in vertex] for vertex in mesh.vertices]
             shape = self.bullet.createVisualShape(
                 p.GEOM_MESH, vertices=scaled, normals=mesh.normals, indices=mesh.indices, **look
@@ -156,41 +156,6 @@ def _rotated(points: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[
     return rotated
 
 
-def _hull(points: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """The corners of the convex hull of points (N, 2) in order (Andrew's monotone chain)."""
-    ordered = sorted(map(tuple, points.tolist()))
-    hull: list[tuple[float, float]] = []
-    for half in (ordered, ordered[::-1]):
-        chain: list[tuple[float, float]] = []
-        for x, y in half:
-            while len(chain) > 1 and _turns_right(chain[-2], chain[-1], (x, y)):
-                chain.pop()
-            chain.append((x, y))
-        hull += chain[:-1]
-    return hull
-
-
-def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) <= 0
-
-
-@lru_cache(maxsize=1)
-def _cone() -> Mesh:
-    return _lathed([(0.0, -1.0), (1.0, -1.0), (0.02, 1.0), (0.0, 1.0)])
-
-
-@lru_cache(maxsize=1)
-def _cylinder() -> Mesh:
-    return _lathed([(0.0, -1.0), (0.9, -1.0), (0.9, 1.0), (0.0, 1.0)])
-
-
-@lru_cache(maxsize=1)
-def _sphere() -> Mesh:
-    angles = [pi * k / 12 - pi / 2 for k in range(13)]
-    return _lathed([(cos(a), sin(a)) for a in angles], round=True)
-
-
-@lru_cache(maxsize=1)
 def _snitch() -> Mesh:
     """Three tori around one centre, each across the other two."""
     ring, tube, around, across = 0.75, 0.25, 16, 8
@@ -212,24 +177,11 @@ def _snitch() -> Mesh:
     return Mesh(vertices, normals, indices)
 
 
-MESHES = {"cone": _cone, "cylinder": _cylinder, "sphere": _sphere, "snitch": _snitch}
-
-
-def _lathed(profile: list[tuple[float, float]], round: bool = False) -> Mesh:
-    """A profile (radius, height), its solid on the left, turned around the z axis; `round` shades it as a ball."""
-    vertices: list[list[float]] = []
-    normals: list[list[float]] = []
-    indices: list[int] = []
-    for (r0, z0), (r1, z1) in pairwise(profile):
-        length = hypot(r1 - r0, z1 - z0)
-        flat = ((z1 - z0) / length, -(r1 - r0) / length)
-        first = len(vertices)
-        for k in range(SEGMENTS + 1):
-            c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
-            vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
-            normals += [[r * c, r * s, z] for r, z in ([(r0, z0), (r1, z1)] if round else [flat] * 2)]
-        for k in range(SEGMENTS):
-            a = first + 2 * k
-            indices += [a, a + 2, a + 1] if r0 > 0 else []
-            indices += [a + 1, a + 2, a + 3] if r1 > 0 else []
-    return Mesh(vertices, normals, indices)
+_BALL = [(cos(a), sin(a)) for a in (pi * k / 12 - pi / 2 for k in range(13))]
+# Profiles are (radius, height); all meshes have radius 1.
+MESHES = {
+    "cone": lathed([(0.0, -1.0), (1.0, -1.0), (0.02, 1.0), (0.0, 1.0)], SEGMENTS),
+    "cylinder": lathed([(0.0, -1.0), (0.9, -1.0), (0.9, 1.0), (0.0, 1.0)], SEGMENTS),
+    "sphere": lathed(_BALL, SEGMENTS, lambda band, k, flat: _BALL[band : band + 2]),
+    "snitch": _snitch(),
+}

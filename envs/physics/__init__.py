@@ -1,7 +1,7 @@
 """The simulated table in PyBullet: bodies, the arm and its motions, and the camera. It knows no task."""
 
 try:
-    import pybullet  # noqa: F401
+    import pybullet
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         "the environments need PyBullet: pip has it for Python 3.10 and 3.11 on Linux (x86-64), and conda-forge for "

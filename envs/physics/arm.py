@@ -4,8 +4,6 @@ With all angles 0 (not UR's own signs) the arm lies stretched along +x and the t
 z, lift, elbow and wrist1 about y (positive lowers), wrist2 about x, wrist3 about z.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 

@@ -1,7 +1,5 @@
 """Cameras: presets, and the matrices that take a world point to a pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from math import cos, radians, sin, tan

@@ -4,8 +4,6 @@ Hover, descend to contact, suck, lift, hover over the place, lower, let go, rise
 looks like a first one, so that several such motions can follow each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from math import dist
 

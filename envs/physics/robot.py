@@ -1,7 +1,5 @@
 """The arm at work: one camera frame at a time it moves its tip, stops at contact, and sucks blocks."""
 
-from __future__ import annotations
-
 from math import dist, pi
 
 import numpy as np

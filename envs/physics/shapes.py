@@ -1,10 +1,9 @@
 """Generated shapes: the lathed bowl, for the eye and for contact. No asset package is needed."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -18,6 +17,9 @@ ARC = 5  # bands of a round wall
 STAR = ((0.0, 1.0), (-1.0, 0.0), (-1.0, 0.0))  # normals (outward, upward) around a round bowl's floor
 WALL_PARTS = 12  # convex parts of the bowl's wall as felt; a block's edge never meets their corners
 
+Profile = list[tuple[float, float]]  # radius and height
+Shade = Callable[[int, int, tuple[float, float]], Profile]
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -28,36 +30,48 @@ class Mesh:
     indices: list[int]
 
 
-@lru_cache(maxsize=16)
-def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
-    """The visible bowl, conical or ``rounded``: lathed, smooth around, with an edge between bands."""
-    profile = _round_profile(sizes) if rounded else _bowl_profile(sizes)
+def lathed(profile: Profile, segments: int, shade: Shade | None = None) -> Mesh:
+    """A profile, its solid on the left, turned around the z axis: smooth around, with an edge between bands.
+
+    Args:
+        segments: corners of the circle.
+        shade: the normals (outward, upward) at both ends of band number i at corner number k, from the band's own.
+    """
     vertices: list[list[float]] = []
     normals: list[list[float]] = []
     indices: list[int] = []
     for band, ((r0, z0), (r1, z1)) in enumerate(pairwise(profile)):
         length = hypot(r1 - r0, z1 - z0)
         # The profile runs with the solid on its left, so the outward normal is its direction turned right.
-        normal_r, normal_z = (z1 - z0) / length, -(r1 - r0) / length
+        flat = ((z1 - z0) / length, -(r1 - r0) / length)
         first = len(vertices)
-        for k in range(SEGMENTS + 1):
-            c, s = cos(2 * pi * k / SEGMENTS), sin(2 * pi * k / SEGMENTS)
+        for k in range(segments + 1):
+            c, s = cos(2 * pi * k / segments), sin(2 * pi * k / segments)
             vertices += [[r0 * c, r0 * s, z0], [r1 * c, r1 * s, z1]]
-            ends = [(normal_r, normal_z)] * 2
-            if rounded and ARC < band <= 2 * ARC:
-                # As CLIPort's bowls look: the inner wall is shaded as if steep, the lowest band as a star.
-                ends = [(-1.0, 0.0)] * 2 if band < 2 * ARC else [STAR[k % 3], (0.0, 1.0)]
-            normals += [[r * c, r * s, z] for r, z in ends]
-        for k in range(SEGMENTS):
+            normals += [[r * c, r * s, z] for r, z in (shade(band, k, flat) if shade else [flat] * 2)]
+        for k in range(segments):
             a = first + 2 * k
-            if r0 > 0:
-                indices += [a, a + 2, a + 1]
-            if r1 > 0:
-                indices += [a + 1, a + 2, a + 3]
+            indices += [a, a + 2, a + 1] if r0 > 0 else []
+            indices += [a + 1, a + 2, a + 3] if r1 > 0 else []
     return Mesh(vertices, normals, indices)
 
 
-def _bowl_profile(sizes: Sizes) -> list[tuple[float, float]]:
+@lru_cache(maxsize=16)
+def bowl_mesh(sizes: Sizes, rounded: bool = False) -> Mesh:
+    """The visible bowl, conical or ``rounded``."""
+    if not rounded:
+        return lathed(_bowl_profile(sizes), SEGMENTS)
+
+    def shade(band: int, k: int, flat: tuple[float, float]) -> Profile:
+        # As CLIPort's bowls look: the inner wall is shaded as if steep, the lowest band as a star.
+        if ARC < band < 2 * ARC:
+            return [(-1.0, 0.0)] * 2
+        return [STAR[k % 3], (0.0, 1.0)] if band == 2 * ARC else [flat] * 2
+
+    return lathed(_round_profile(sizes), SEGMENTS, shade)
+
+
+def _bowl_profile(sizes: Sizes) -> Profile:
     """(radius, height) from the outer foot over the rim to the centre of the inner floor."""
     return [
         (sizes.bowl_foot_radius, 0.0),
@@ -68,11 +82,11 @@ def _bowl_profile(sizes: Sizes) -> list[tuple[float, float]]:
     ]
 
 
-def _round_profile(sizes: Sizes) -> list[tuple[float, float]]:
+def _round_profile(sizes: Sizes) -> Profile:
     """The same for a bowl that is round inside and outside."""
     flat, height = 0.45 * sizes.bowl_radius, sizes.bowl_height
 
-    def arc(rim: float, low: float) -> list[tuple[float, float]]:
+    def arc(rim: float, low: float) -> Profile:
         angles = [pi / 2 * k / ARC for k in range(ARC + 1)]
         return [(flat + (rim - flat) * sin(a), low + (height - low) * (1 - cos(a))) for a in angles]
 

@@ -1,7 +1,5 @@
 """The physical tabletop: a PyBullet world built from a scene, stepped, read out and rendered."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What stands on what, read off the simulator."""
 
-from __future__ import annotations
-
 from math import hypot
 
 import pybullet as p

@@ -1,7 +1,5 @@
 """The real shape of a UR5: the light meshes of the package `example-robot-data` (extra `ur5`, BSD licence)."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from math import cos, radians

@@ -9,5 +9,3 @@ TASKS: dict[str, Task] = {
     "put_blocks_in_bowls": Task((In(),), pairs=(2, 3)),
     "rearrange_blocks": Rearrange(),
 }
-
-__all__ = ["TASKS", "In", "Question", "Relation", "Task"]

@@ -1,7 +1,5 @@
 """What a task is: the sentences that may be said, the scenes, what the expert does, and when it is done."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence

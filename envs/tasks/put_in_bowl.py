@@ -1,7 +1,5 @@
 """``put the <color> block in the <color> bowl``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ..physics.robot import Robot

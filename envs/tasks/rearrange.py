@@ -1,7 +1,5 @@
 """Blocks in bowls and on blocks, where a sentence does not always lead to what it says."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush

@@ -57,12 +57,7 @@ class Cater:
         camera = PinholeCamera(self.table.camera.intrinsics, self.table.camera.extrinsics)
         of_all = zip(self.called, self.clip.things, self.clip.poses(0)[0], strict=True)
         return [
-            {
-                "name": name,
-                "color": list(thing.rgb),
-                "at": camera.project(center).tolist(),
-                "height": float(center[2]),
-            }
+            {"name": name, "color": list(thing.rgb), "at": camera.project(center).tolist(), "height": float(center[2])}
             for name, thing, center in of_all
         ]
 

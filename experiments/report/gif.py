@@ -1,7 +1,5 @@
 """Animations: frames and masks side by side, as GIF bytes."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 

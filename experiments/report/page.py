@@ -1,7 +1,5 @@
 """`report.html` and `index.html`: each one file with everything in it, which opens offline, on a phone too."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

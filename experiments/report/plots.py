@@ -1,7 +1,5 @@
 """Plots, each drawn for light and for dark pages: figures with intervals, curves, heat maps, grids of pictures."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A measured figure with its interval. Scenes are independent; slot seeds and variants of one scene are not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The models of the ablation study: which there are to train, and what there is of each in the folder of all runs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace

@@ -1,7 +1,8 @@
-"""Episodes of any size: what models of another size imagine, how its masks fit the truth, and a film of both."""
+"""Episodes of any size: what models of another size imagine, how it fits the truth, and films of both."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,14 +12,18 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
+from experiments.report.page import Clip
+from experiments.report.tables import Column
+from experiments.study.frame_metrics import METRICS, Scorer
 from experiments.study.pool import Worker
-from experiments.study.predictions import to_uint8
+from experiments.study.predictions import Prediction, hold_last, to_uint8
 from textocvp.data.episodes import Episode
 from textocvp.metrics import foreground_ari, object_ious
 from textocvp.rollout import Rollout
 
 # Frames that are decoded at once: masks of a whole episode at 336x336 take a quarter of a gigabyte.
 AT_ONCE = 8
+TITLES = {**METRICS, "iou": "mask IoU", "ari": "FG-ARI"}
 
 
 class Seen(NamedTuple):
@@ -79,6 +84,54 @@ def mask_curves(labels_THW: np.ndarray, truth: Episode) -> dict[str, np.ndarray]
     overlaps = [object_ious(labels, masks, ids, min_pixels=1).ious for labels, masks in pairs]
     iou = [its.mean() if len(its) else np.nan for its in overlaps]
     return {"iou": np.array(iou), "ari": np.array([foreground_ari(*pair) for pair in pairs])}
+
+
+def compare(
+    scorer: Scorer, method: str, seen: Seen, truth: Episode, lengths: Mapping[str, int]
+) -> dict[tuple[str, str, str], float]:
+    """Means over the first so many frames after the observed one; what is shown is held where it ends too early."""
+    T = len(truth.frames)
+    frames = scorer.score(Prediction(method, hold_last(seen.frames, T))).curves
+    curves = {**frames, **mask_curves(hold_last(seen.labels, T), truth)}
+    return {
+        (method, length, metric): float(np.nanmean(curve[:n]))
+        for (length, n), (metric, curve) in product(lengths.items(), curves.items())
+        if 0 < n < T and np.isfinite(curve[:n]).any()
+    }
+
+
+def length_columns(split: str, lengths: Iterable[str], metrics: Iterable[str]) -> list[Column]:
+    """A column for each metric at each length, such as `9 frames`."""
+    return [
+        Column(f"{TITLES[m]} {length.removesuffix(' frames')}", split, length, m, 2 if m == "psnr" else 3)
+        for length, m in product(lengths, metrics)
+    ]
+
+
+@dataclass(frozen=True)
+class Film:
+    """A unit of work: what happened beside what ours imagines, above the masks."""
+
+    study: str  # its name
+    watch: Callable[[Worker], Episode]  # what happened
+    seed: int
+    caption: str
+    details: Callable[[Episode, Seen], str] | None = None  # what the caption ends in
+    best: bool = True
+    rank: int = 1
+
+    def run(self, worker: Worker) -> Clip:
+        """Imagine it once more."""
+        truth, place = self.watch(worker), f"{'best' if self.best else 'worst'} {self.rank}"
+        seen = imagine(worker, worker.world_model, truth.frames[0], truth.instruction, len(truth.frames) - 1, self.seed)
+        return Clip(
+            name=f"{self.study}-{place.replace(' ', '-')}.gif",
+            gif=film(truth, seen),
+            panels=("real", "ours"),
+            title=truth.instruction,
+            caption=self.caption + (self.details(truth, seen) if self.details else ""),
+            badge=place,
+        )
 
 
 def film(truth: Episode, seen: Seen) -> bytes:

@@ -1,7 +1,5 @@
 """Which words the slots of imagined rollouts attend to (paper, section 4.5)."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Sequence

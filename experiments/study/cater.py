@@ -1,7 +1,5 @@
 """What CATER's scenes are for a study, and how an imagined clip is judged: from masks, by the simulator's rules."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Episodes that are CLIPort's or look so: where they come from, and by what an imagined sentence succeeds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -33,9 +31,10 @@ Source = Recorded | StudyScene  # an episode in a file, or a scene of our own in
 
 
 def read(source: Source, worker: Worker) -> Episode:
-    """All of an episode."""
+    """All of an episode, its sentence in our own wording."""
     if isinstance(source, Recorded):
-        return source.opened.episode(source.index)
+        episode = source.opened.episode(source.index)
+        return replace(episode, instruction=Instruction.parse(episode.instruction).text)
     env = cast(TabletopEnv, worker.environment(source).unwrapped)
     number = source.seed - SPLITS[source.split].first_seed
     played = record_episode(env, EpisodeConfig(source.split), number)

@@ -1,14 +1,14 @@
 """Clips for a report: imagined beside real, the best cases and the worst ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
 from experiments.report.page import Clip, Tone
+from experiments.study.any_size import Film
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome
 from experiments.study.mask_metrics import labels_of
 from experiments.study.methods import HORIZON, Model
@@ -121,7 +121,11 @@ def episode_clips(
     return [EpisodeClip(o, column, rank) for rank, (column, o) in enumerate(chosen, start=1)]
 
 
-def extreme_clips(clips: Sequence[PredictionClip], badness: Sequence[float], count: int) -> list[PredictionClip]:
+Case = TypeVar("Case", bound=Any)  # a unit with the fields `scene`, `best` and `rank`
+Ranked = TypeVar("Ranked", PredictionClip, Film)  # units with the fields `best` and `rank`
+
+
+def extreme_clips(clips: Sequence[Ranked], badness: Sequence[float], count: int) -> list[Ranked]:
     """The `count` best and then the `count` worst, each with its rank, most extreme first; none is both.
 
     Of an odd number of clips too few for all, the best have one more.
@@ -134,6 +138,18 @@ def extreme_clips(clips: Sequence[PredictionClip], badness: Sequence[float], cou
         for good, chosen in ((True, order[:best]), (False, order[::-1][:worst]))
         for rank, i in enumerate(chosen, start=1)
     ]
+
+
+def extremes_by_scene(cases: Sequence[Case], badness: Sequence[Any], count: int) -> list[Case]:
+    """The `count` best and the `count` worst cases, each of another scene, with their ranks."""
+    chosen = []
+    for best in (True, False):
+        firsts: dict[int, Case] = {}
+        for i in sorted(range(len(cases)), key=badness.__getitem__, reverse=not best):
+            firsts.setdefault(cases[i].scene.seed, cases[i])
+        ranked = enumerate(list(firsts.values())[:count], start=1)
+        chosen += [replace(case, best=best, rank=rank) for rank, case in ranked]
+    return chosen
 
 
 def best_and_worst(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import fmean
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from textocvp.protocols import LoadModel
 class LoopOutcome:
     """What came of one episode."""
 
-    episode: LoopEpisode  # which one
+    episode: LoopEpisode  # which one; or another study's, with `who` and `place`
     text: str  # the goal
     success: bool  # the simulator's verdict
     gained: float  # by how much the share of the goal that holds rose, by the simulator
@@ -45,6 +46,21 @@ class LoopOutcome:
     planning_seconds: float | None = None  # mean time of a plan; None without one
     error: str | None = None  # why the loop gave up, or None
 
+    @classmethod
+    def of(cls, episode: LoopEpisode, text: str, result: EpisodeResult, first: bool | None = None) -> LoopOutcome:
+        """What came of an episode in which a planner acted."""
+        return cls(
+            episode=episode,
+            text=text,
+            success=result.success,
+            gained=round(result.gained, 6),
+            believes_reached=result.believes_reached,
+            instructions=tuple(attempt.instruction.text for attempt in result.attempts),
+            ranked_first=first,
+            planning_seconds=result.planning_seconds if result.attempts else None,
+            error=result.error,
+        )
+
     @property
     def steps(self) -> int:
         """Pick-and-places carried out."""
@@ -54,20 +70,8 @@ class LoopOutcome:
     def lines(self) -> list[EpisodeLine]:
         """For `results.json`."""
         of, scene = self.episode, self.episode.scene
-        who = of.method if of.load is None else f"{of.method}, {of.load}"
-        return [
-            EpisodeLine(
-                who,
-                place_of(scene, of.variant),
-                "closed_loop_success",
-                scene_hash(scene),
-                scene.seed,
-                self.text,
-                float(self.success),
-                self.instructions,
-                self.error,
-            )
-        ]
+        what = of.who, of.place, "closed_loop_success", scene_hash(scene), scene.seed
+        return [EpisodeLine(*what, self.text, float(self.success), self.instructions, self.error)]
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,16 @@ class LoopEpisode:
         """Who acts."""
         return METHODS[self.method]
 
+    @property
+    def who(self) -> str:
+        """`method` of its line in `results.json`."""
+        return self.method if self.load is None else f"{self.method}, {self.load}"
+
+    @property
+    def place(self) -> str:
+        """`place` of its line."""
+        return place_of(self.scene, self.variant)
+
     def order(self, goal: Goal) -> tuple[str, ...]:
         """What the expert does, in order."""
         return tuple(instruction.text for instruction in goal.instructions)
@@ -103,17 +117,7 @@ class LoopEpisode:
         result = self.pursue(worker, sampled)
         ranks = self.acts.kind != "control" and len(goal.instructions) == 1
         first = [attempt.plan.best.instructions for attempt in result.attempts[:1]]
-        return LoopOutcome(
-            episode=self,
-            text=text,
-            success=result.success,
-            gained=round(result.gained, 6),
-            believes_reached=result.believes_reached,
-            instructions=tuple(attempt.instruction.text for attempt in result.attempts),
-            ranked_first=first == [goal.instructions] if ranks else None,
-            planning_seconds=result.planning_seconds if result.attempts else None,
-            error=result.error,
-        )
+        return LoopOutcome.of(self, text, result, first == [goal.instructions] if ranks else None)
 
     def pursue(self, worker: Worker, sampled: SampledScene) -> EpisodeResult:
         """Plan and act until the goal is believed to be reached, or the attempts are used up."""
@@ -137,12 +141,15 @@ class LoopEpisode:
         )
 
 
-def planning_seconds(
-    outcomes: Sequence[LoopOutcome], column_of: Callable[[LoopEpisode], str]
-) -> dict[str, dict[str, float]]:
-    """Mean seconds of a plan, method -> column -> seconds. Not for results.json, which must come out the same again."""
+def planning_seconds(outcomes: Sequence[LoopOutcome], column_of: Callable[[Any], str]) -> dict[str, dict[str, float]]:
+    """Mean seconds of a plan, method -> column -> seconds."""
     seconds: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for o in outcomes:
         if o.planning_seconds is not None:
             seconds[o.episode.method][column_of(o.episode)].append(o.planning_seconds)
     return {method: {title: round(fmean(its), 3) for title, its in table.items()} for method, table in seconds.items()}
+
+
+def timings(outcomes: Sequence[LoopOutcome], column_of: Callable[[Any], str]) -> dict[str, str]:
+    """The file with `planning_seconds`, which is not `results.json`: that must come out the same again."""
+    return {"timings.json": json.dumps(planning_seconds(outcomes, column_of), indent=2) + "\n"}

@@ -1,7 +1,5 @@
 """Who searches a course of sentences towards a goal, by foresight or without; and how often foresight is right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast

@@ -1,8 +1,6 @@
 """How much imagined frames look like the real ones, frame by frame."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -61,25 +59,35 @@ class Measures:
         """The metric by which cases are ranked: LPIPS, else ST-LPIPS, else SSIM."""
         return self.perceptual[0] if self.perceptual else "ssim"
 
+    def badness(self, value: float) -> float:
+        """A figure of `main`, so that more is worse."""
+        return -value if self.main == "ssim" else value
+
     @property
     def absent(self) -> str:
         """Sentences for a report; empty if nothing is absent."""
         return " ".join(f"{METRICS[name]} is absent: {reason}." for name, reason in self.reasons)
 
 
-def available_measures(jedi: str | None = None, jedi_lengths: tuple[int, ...] = (), without_jedi: str = "") -> Measures:
+def available_measures(
+    wanted: Sequence[str] = tuple(PERCEPTUAL),
+    jedi: str | None = None,
+    jedi_lengths: tuple[int, ...] = (),
+    without_jedi: str = "",
+) -> Measures:
     """What can be measured on this machine.
 
     Args:
+        wanted: of `PERCEPTUAL`.
         jedi: the V-JEPA that is wanted, or None. without_jedi: why none is.
     """
     reasons = {"jedi": without_jedi} if jedi is None and without_jedi else {}
-    for metric in (*PERCEPTUAL, *(["jedi"] if jedi else [])):
+    for metric in (*wanted, *(["jedi"] if jedi else [])):
         try:
             _ = video_features(jedi) if jedi and metric == "jedi" else perceptual(metric)
         except MetricUnavailable as error:
             reasons[metric] = str(error)
-    found = tuple(metric for metric in PERCEPTUAL if metric not in reasons)
+    found = tuple(metric for metric in wanted if metric not in reasons)
     order = [(metric, reasons[metric]) for metric in METRICS if metric in reasons]
     return Measures(found, None if "jedi" in reasons else jedi, jedi_lengths, tuple(order))
 

@@ -1,7 +1,5 @@
 """Do imagined rollouts show what the sentence says? Judged on their masks (paper, section 4.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,14 +9,15 @@ from torch import Tensor
 
 from experiments.study.methods import HORIZON
 from planning import (
+    THRESHOLDS,
     AppearanceGrounder,
     Grounding,
     GroundingError,
     Imagines,
     Instruction,
-    SuccessCriterion,
     Trace,
     measure_rollout,
+    succeeds,
 )
 from textocvp import Rollout
 
@@ -71,8 +70,7 @@ def first_frame(traced: Trace) -> Trace:
 
 def judge(traced: Trace) -> tuple[Tensor, Tensor]:
     """Success (V,) and miss (V,) of each rollout; see `Verdicts`."""
-    criterion = SuccessCriterion()
-    return criterion(traced), traced.distance_Bt[:, -criterion.thresholds.settle_frames :].mean(1)
+    return succeeds(traced), traced.distance_Bt[:, -THRESHOLDS.settle_frames :].mean(1)
 
 
 def stack(judged: Sequence[Sequence[Tensor]]) -> Verdicts:

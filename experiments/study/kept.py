@@ -7,8 +7,6 @@ layout do not matter, and neither does git. A run of another identity starts ane
 study into no folder that somebody else has filled.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """How well masks fit the simulator's segmentation, frame by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 To compare another baseline or another planner, add one entry to `METHODS`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The same scene in other light, through a worse camera or in other words: does the imagined block reach its bowl?"""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Work units on several processes, with results in order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """What every model and every control imagines of one scene, beside what really happened."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar, cast

@@ -1,7 +1,5 @@
 """The scenes of the studies, sampled by the environments from the seeds of a split: no data file is needed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

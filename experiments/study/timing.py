@@ -1,7 +1,5 @@
 """How time is taken: competitors in turns, medians of rounds, and what figures in seconds depend on."""
 
-from __future__ import annotations
-
 import platform
 import time
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """The tabletop's sentence in other words: every kind that users were seen to write, drawn at random."""
 
-from __future__ import annotations
+from pathlib import Path
 
 import numpy as np
 
@@ -32,51 +32,11 @@ def paraphrase(number: int, block: str, bowl: str) -> str:
     return (text, text, text.capitalize(), text.upper())[int(rng.integers(4))] + one_of(AFTER)
 
 
-# Written by somebody who had seen neither the models' rules nor the wordings that these were made from.
-FREE = (
-    "Place the {block} block into the {bowl} bowl.",
-    "please put the {block} cube in the {bowl} bowl",
-    "Could you drop the {block} block into the {bowl} dish?",
-    "Pick up the {block} block and put it in the {bowl} bowl.",
-    "Take the {block} cube. Put it inside the {bowl} bowl.",
-    "I'd like the {block} block to be in the {bowl} bowl.",
-    "In the {bowl} bowl, put the {block} block.",
-    "Grab the {block} brick and drop it in the {bowl} bowl",
-    "The {block} block goes in the {bowl} bowl.",
-    "move the {block} block to the inside of the {bowl} bowl",
-    "Can you please move the {block} cube into the {bowl} basin?",
-    "Okay, now set the {block} block down inside the {bowl} bowl, please.",
-    "PUT THE {block} BLOCK INTO THE {bowl} BOWL",
-    "I want you to place the {block} block within the {bowl} bowl.",
-    "Hey robot, stick the {block} block in the {bowl} bowl!",
-    "See the {block} block? Put it in the {bowl} bowl.",
-    "Get the {block} one of the blocks and place it in the {bowl} bowl.",
-    "Would you mind putting the {block} block in the {bowl} bowl?",
-    "Fill the {bowl} bowl with the {block} block.",
-    "Find the {block} block, then drop it into the {bowl} bowl.",
-    "Put the {block} block in the bowl that is {bowl}.",
-    "Please take the block that's {block} and put it into the {bowl} bowl",
-    "{block} block into the {bowl} bowl, please.",
-    "Just pop the {block} cube into the {bowl} bowl, would you?",
-    "The {bowl} bowl should have the {block} block in it.",
-    "Lift the {block} block and lower it into the {bowl} bowl.",
-    "Transfer the {block} block into the {bowl} container.",
-    "Into the {bowl} bowl goes the {block} cube!",
-    "Let's put the {block} toy block in the {bowl} bowl.",
-    "I need the {block} brick inside the {bowl} dish, thanks.",
-    "Pick the {block} block up. Now drop it in the {bowl} bowl.",
-    "Um, can you put the {block} block in the {bowl} bowl for me?",
-    "Make sure the {block} block ends up in the {bowl} bowl.",
-    "Use the {bowl} bowl to hold the {block} block.",
-    "Find the {bowl} bowl and put the {block} block in it.",
-    "Pick up the {block} block and put the {block} block inside the {bowl} bowl.",
-    "Of all the blocks, put the {block} one in the {bowl} bowl.",
-    "Of the bowls, choose the {bowl} one and drop the {block} block into it.",
-    "It would be great if you could get the {block} cube into the {bowl} bowl.",
-    "so, take the {block} square block and tuck it inside the {bowl} cup",
-)
+FREE = Path(__file__).with_name("free-wordings.txt")
+"""Written by somebody who had seen neither the models' rules nor the wordings that these were made from."""
 
 
 def free_wording(number: int, block: str, bowl: str) -> str:
     """One of `FREE` instead of "put the {block} block in the {bowl} bowl"."""
-    return FREE[number % len(FREE)].format(block=block, bowl=bowl)
+    wordings = FREE.read_text().splitlines()
+    return wordings[number % len(wordings)].format(block=block, bowl=bowl)

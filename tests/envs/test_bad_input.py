@@ -31,17 +31,9 @@ def layout(*items: dict[str, Any], **change: Any) -> dict[str, Any]:
             layout(RED, BLUE) | {"instruction": "put the green block in the blue bowl"},
             "the scene has no green block; it has: red block, blue bowl",
         ),
-        (
-            layout(RED, BLUE) | {"instruction": "put the red block in the red bowl"},
-            "the scene has no red bowl; it has",
-        ),
+        (layout(RED, BLUE) | {"instruction": "put the red block in the red bowl"}, "the scene has no red bowl; it has"),
         ({"instruction": "put the red block in the red bowl"}, "must not name a colour twice"),
-        (
-            {
-                "instruction": "put the red block in the blue bowl and the green block in the gray bowl",
-            },
-            "at most 1 ",
-        ),
+        ({"instruction": "put the red block in the blue bowl and the green block in the gray bowl"}, "at most 1 "),
         (layout(RED, BLUE, color="red"), "no two objects may share a colour, but red"),
         (layout(RED, BLUE, xy=(0.42, -0.12)), "red block overlap; their centres must be at least 0.1"),
         (layout(BLUE, GREEN, RED, xy=(0.6, 0.14)), "overlap; .* within 0.019 m of a bowl's centre"),
@@ -54,10 +46,7 @@ def layout(*items: dict[str, Any], **change: Any) -> dict[str, Any]:
         ({"layout": [RED]}, "2 to 8 objects, not 1"),
         ({"layout": [BLUE, GREEN]}, "at least one block"),
         (layout(RED, BLUE) | {"n_objects": 6}, "n_objects describe a random scene"),
-        (
-            layout(BLUE, RED, xy=(0.6, 0.1)) | {"instruction": "put the red block in the blue bowl"},
-            "already fulfils",
-        ),
+        (layout(BLUE, RED, xy=(0.6, 0.1)) | {"instruction": "put the red block in the blue bowl"}, "already fulfils"),
         ({"n_objects": 9}, "n_objects must be 2 to 8 .* so that all fit on the table; got 9"),
         ({"n_objects": 1}, "n_objects must be 2 to 8"),
         ({"n_objects": 2.5}, "n_objects must be a whole number"),

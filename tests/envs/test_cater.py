@@ -130,11 +130,7 @@ def test_ambiguous_captions_say_less():
 
 
 def test_actions_can_be_asked_for():
-    things = (
-        thing("cone", "large"),
-        thing("sphere", "small", (2.0, 2.0)),
-        thing("cube", "small", (-2.0, -2.0)),
-    )
+    things = (thing("cone", "large"), thing("sphere", "small", (2.0, 2.0)), thing("cube", "small", (-2.0, -2.0)))
     for seed in range(5):
         acts = draw_acts(np.random.default_rng(seed), things, first=(0, "contain"))
         assert acts is not None
@@ -181,13 +177,7 @@ def test_a_file_is_the_same_for_any_number_of_workers(tmp_path):
     collect(config, 5, tmp_path / "two.h5", workers=2)
     with h5py.File(tmp_path / "one.h5") as one, h5py.File(tmp_path / "two.h5") as two:
         names = [
-            name
-            for name in (
-                "frames",
-                "segmentation",
-                "object_position",
-                *(f"episode/{n}" for n in one["episode"]),
-            )
+            name for name in ("frames", "segmentation", "object_position", *(f"episode/{n}" for n in one["episode"]))
         ]
         assert all(np.array_equal(one[name][:], two[name][:], equal_nan=name == "object_position") for name in names)
         assert json.loads(one.attrs["labels"]) == {"background": 0}

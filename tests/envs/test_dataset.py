@@ -204,11 +204,7 @@ def test_sentences_are_the_same_from_two_workers_and_in_two_runs(sentences: Path
 
 
 def test_files_of_other_policies_are_not_mixed(whole: Path, sentences: Path) -> None:
-    for path, config in (
-        (whole, SENTENCES),
-        (sentences, SMALL),
-        (sentences, replace(SENTENCES, sentences=2)),
-    ):
+    for path, config in ((whole, SENTENCES), (sentences, SMALL), (sentences, replace(SENTENCES, sentences=2))):
         with pytest.raises(ValueError, match=r"was collected with .* differs from"):
             collect(config, 20, path)
     with h5py.File(whole) as file:
@@ -335,10 +331,7 @@ def test_killed_again_and_again_it_loses_and_doubles_nothing(whole: Path, tmp_pa
     kills = 0
     for attempt in range(12):
         process = subprocess.Popen(
-            [sys.executable, "-c", RUN, str(path)],
-            cwd=ROOT,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
+            [sys.executable, "-c", RUN, str(path)], cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True
         )
         before = progress(path)
         while process.poll() is None and (attempt >= 8 or progress(path) == before):

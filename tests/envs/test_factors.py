@@ -39,11 +39,7 @@ print("hash", hashlib.sha256(b"".join(bytes(part) for part in parts)).hexdigest(
 def test_each_factor_changes_the_picture_and_only_when_it_is_on(make: Make, name: str) -> None:
     others = [other for other in FACTORS if other != name]
     shown = {}
-    for key, factors in {
-        "on": ALWAYS.without(others),
-        "off": NO_FACTORS,
-        "all but it": ALWAYS.without([name]),
-    }.items():
+    for key, factors in {"on": ALWAYS.without(others), "off": NO_FACTORS, "all but it": ALWAYS.without([name])}.items():
         env = make(scene="cliport", image_size=96, factors=factors)
         observation, info = env.reset(seed=3, options={"n_bowls": 3})
         shown[key] = observation["rgb"], info["factors"]
@@ -170,10 +166,7 @@ def test_a_layout_may_double_colours_and_say_what_is_held(make: Make) -> None:
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        (
-            [RED, BLUE, RED | {"color": "gray", "position": (0.4, 0.0, 0.3)}],
-            "can hold one block at the start",
-        ),
+        ([RED, BLUE, RED | {"color": "gray", "position": (0.4, 0.0, 0.3)}], "can hold one block at the start"),
         ([RED | {"position": (0.5, 0.2, 0.6)}, BLUE], "cannot hold the red block at .*, 0.6 m high"),
     ],
 )

@@ -321,10 +321,7 @@ def test_observations_are_those_that_were_asked_for(make: Make) -> None:
     assert flat.observation_space.shape == flat.reset(seed=0)[0].shape == (120 + 133,)
     assert set(make(image_size=16, extras="goal").observation_space) == {"rgb", "instruction", "goal", *GOALS}
     for wrong, message in (
-        (
-            {"observations": "goal_rgb"},
-            "unknown observation 'goal_rgb'; allowed: 'rgb', 'instruction', 'depth'",
-        ),
+        ({"observations": "goal_rgb"}, "unknown observation 'goal_rgb'; allowed: 'rgb', 'instruction', 'depth'"),
         ({"observations": ()}, "at least one"),
         ({"observations": "rgb", "extras": "depth"}, "goes without extras"),
         ({"extras": "goals"}, "unknown extras 'goals'; allowed: 'depth'"),

@@ -86,10 +86,7 @@ def test_an_argument_is_the_reset_option(make: Make) -> None:
     eight.close()
 
 
-LAYOUT = [
-    {"kind": "block", "color": "red", "xy": (0.5, 0.1)},
-    {"kind": "bowl", "color": "blue", "xy": (0.5, -0.1)},
-]
+LAYOUT = [{"kind": "block", "color": "red", "xy": (0.5, 0.1)}, {"kind": "bowl", "color": "blue", "xy": (0.5, -0.1)}]
 
 
 def test_a_list_of_scenes_is_walked_through(make: Make, tmp_path: Path) -> None:
@@ -114,11 +111,7 @@ def test_a_list_of_scenes_is_walked_through(make: Make, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
-        (
-            {"n_object": 8},
-            TypeError,
-            "unexpected argument 'n_object'; reset options that are arguments: .*n_obj",
-        ),
+        ({"n_object": 8}, TypeError, "unexpected argument 'n_object'; reset options that are arguments: .*n_obj"),
         ({"n_objects": 9}, ValueError, "n_objects must be 2 to 8"),
         ({"layout": LAYOUT, "n_objects": 3}, ValueError, "cannot be given with a layout"),
         ({"scenes": []}, ValueError, "a list of at least one seed or mapping"),

@@ -38,19 +38,12 @@ def report(quick: bool = False) -> Report:
     table = Table(
         "Predicted success",
         ["original", "variant 1", "variant 2", "variant 3", "variants mean"],
-        [
-            TableRow("ours", [Cell.of(row())] * 5, "ours", "a note"),
-            TableRow("paper", [Cell("0.83")] * 5, "paper"),
-        ],
+        [TableRow("ours", [Cell.of(row())] * 5, "ours", "a note"), TableRow("paper", [Cell("0.83")] * 5, "paper")],
     )
     labels_THW = np.random.default_rng(0).integers(0, 5, (4, 16, 16))
     film = paint(labels_THW, segmentation_colors(3))
     clip = Clip(
-        "a.gif",
-        gif([[film, film], [film, film]]),
-        ("imagined", "real"),
-        "put <b>it</b> there",
-        badge="worst 1",
+        "a.gif", gif([[film, film], [film, film]]), ("imagined", "real"), "put <b>it</b> there", badge="worst 1"
     )
     plot = interval_plot("p.png", ["original", "variants"], [Series("ours", [(0.9, 0.8, 1.0), None])], label="success")
     heat = heat_map("h.png", np.eye(3), ["block", "bowl", "arm"], ["put", "the", "block"], label="attention")

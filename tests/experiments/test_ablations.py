@@ -10,16 +10,7 @@ from torch import nn
 
 import textocvp
 from envs.colors import COLORS
-from experiments.ablations import (
-    STUDY,
-    Args,
-    Entrant,
-    FollowingScene,
-    Outcome,
-    Sizes,
-    slots_name,
-    tables,
-)
+from experiments.ablations import STUDY, Args, Entrant, FollowingScene, Outcome, Sizes, slots_name, tables
 from experiments.report.rows import Row, figure_rows
 from experiments.study.ablation_runs import PREDICTORS, RUNS, find_run, load_run
 from experiments.study.pool import Worker
@@ -166,9 +157,4 @@ def test_a_scene_is_imagined_with_as_many_slots_as_asked() -> None:
 def test_a_table_without_any_figure_is_a_table(tmp_path: Path) -> None:
     table = tables([find_run(run, tmp_path).line for run in PREDICTORS], (), ())[0].table([])
     assert {cell.text for row in table.rows for cell in row.cells} == {"\u2013"}
-    assert [row.note.split(";")[0] == "not trained" for row in table.rows] == [
-        False,
-        *[True] * 8,
-        False,
-        False,
-    ]
+    assert [row.note.split(";")[0] == "not trained" for row in table.rows] == [False, *[True] * 8, False, False]

@@ -202,21 +202,9 @@ def test_a_phone_shows_the_index(args: Args, tmp_path: Path) -> None:
         "document.documentElement.scrollWidth - innerWidth; });</script>"
     )
     page.write_text(page.read_text().replace("</body>", probe + "</body>"))
-    flags = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--hide-scrollbars",
-        "--disable-background-networking",
-    ]
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--disable-background-networking"]
     assert CHROMIUM is not None
-    command = [
-        CHROMIUM,
-        *flags,
-        f"--user-data-dir={tmp_path / 'profile'}",
-        "--window-size=500,900",
-        "--dump-dom",
-    ]
+    command = [CHROMIUM, *flags, f"--user-data-dir={tmp_path / 'profile'}", "--window-size=500,900", "--dump-dom"]
     shown = subprocess.run([*command, page.as_uri()], capture_output=True, text=True, timeout=120, env=os.environ)
     found = re.search(r'data-probe="(-?\d+)"', shown.stdout)
     assert found and int(found[1]) <= 0

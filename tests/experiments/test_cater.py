@@ -108,15 +108,9 @@ def test_the_study_measures_what_it_promises(tmp_path) -> None:
     )
     assert isinstance(results, Results)
     head = results.headline
-    assert {
-        "ssim_9",
-        "ssim_19",
-        "ssim_9_copy",
-        "iou_9",
-        "control_object",
-        "control_action",
-        "control_place",
-    } <= set(head)
+    assert {"ssim_9", "ssim_19", "ssim_9_copy", "iou_9", "control_object", "control_action", "control_place"} <= set(
+        head
+    )
     truth = {row.metric: row.value for row in results.rows if row.method == "true frames" and row.variant == "control"}
     assert head["control_object_copy"] == 0.0 and truth["object"] >= 0.5
     assert (tmp_path / "report.html").stat().st_size > 10_000

@@ -8,15 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.controllability import (
-    HEADLINE,
-    LOOP_PLACES,
-    STUDY,
-    PredictedScene,
-    Sizes,
-    column_of,
-    predicted_clips,
-)
+from experiments.controllability import HEADLINE, LOOP_PLACES, STUDY, PredictedScene, Sizes, column_of, predicted_clips
 from experiments.study.clips import episode_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.pool import Worker

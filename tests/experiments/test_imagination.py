@@ -9,16 +9,7 @@ import pytest
 
 import textocvp
 from envs.tasks.rearrange import FAMILIES
-from experiments.imagination import (
-    ATTEMPTS,
-    SEEDS,
-    STUDY,
-    Args,
-    Episode,
-    Sizes,
-    family_scene,
-    goal_of,
-)
+from experiments.imagination import ATTEMPTS, SEEDS, STUDY, Args, Episode, Sizes, family_scene, goal_of
 from experiments.study.foresight import CASES, LINES, OURS, ByFilms, Foresight, TrueSlotsPlanner, foresight
 from experiments.study.pool import Worker
 from experiments.study.run import UsageError, run
@@ -58,8 +49,8 @@ def test_an_episode_comes_out_the_same_again_and_keeps_to_its_attempts(worker: W
     for family in ("occupied", "picture"):
         for key in ("random", OURS):
             first, again = (Episode(key, family_scene(family, 5_000), seed=0).run(worker) for _ in range(2))
-            assert (first.said, first.success) == (again.said, again.success)
-            assert len(first.said) <= ATTEMPTS[family]
+            assert (first.instructions, first.success) == (again.instructions, again.success)
+            assert first.steps <= ATTEMPTS[family]
 
 
 def test_goals_are_sentences_or_pictures(worker: Worker) -> None:
@@ -124,10 +115,10 @@ def test_episodes_on_cliports_table() -> None:
         played[key, family] = Episode(key, scene, seed=0).run(worker)
     assert played["simulator", "occupied"].success and played["no imagination", "plain"].success
     assert not played["no imagination", "occupied"].success
-    assert all(1 <= len(one.said) <= ATTEMPTS[family] for (_, family), one in played.items())
+    assert all(1 <= one.steps <= ATTEMPTS[family] for (_, family), one in played.items())
     env = worker.environment(scene, record=False)
     observation, _ = env.reset(seed=scene.seed, options=dict(scene.options))
-    said = [played["no imagination", "plain"].said[0]] * 2
+    said = [played["no imagination", "plain"].instructions[0]] * 2
     ends = model.outcome(model.parse(observation["rgb"][None]), said)
     film = model.rollout(model.parse(observation["rgb"][None]), said[:1], horizon=model.longest_horizon)
     np.testing.assert_allclose(ends.positions[1, 1], film.positions[0, -1], atol=1e-3)

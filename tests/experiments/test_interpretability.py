@@ -22,15 +22,7 @@ from experiments.interpretability import (
     headline,
 )
 from experiments.report.rows import figure_rows, pick_figures
-from experiments.study.attention import (
-    GROUPS,
-    TEMPLATE,
-    glow,
-    lead,
-    merge_tokens,
-    read_attention,
-    without_color_term,
-)
+from experiments.study.attention import GROUPS, TEMPLATE, glow, lead, merge_tokens, read_attention, without_color_term
 from experiments.study.pool import Worker
 from experiments.study.run import Run, StudyArgs, UsageError, run
 from experiments.study.scenes import study_scenes

@@ -107,10 +107,7 @@ def test_a_model_that_can_look_further_is_measured_further() -> None:
     assert {len(far["ours"].iou), len(far["true frames"].iou)} == {41}
     rows = {(r.method, r.variant) for r in method_rows([far], ["iou"])}
     assert ("ours", "frames 1-40") in rows and ("OCVP-Seq", "frame 40") not in rows
-    assert {r.variant for r in method_rows([near], ["iou"]) if r.method == "ours"} == {
-        "frames 1-9",
-        "frame 9",
-    }
+    assert {r.variant for r in method_rows([near], ["iou"]) if r.method == "ours"} == {"frames 1-9", "frame 9"}
     assert near["copy seed"].iou.shape == (25,)  # as long as the longest of all methods
     # The scene rests in its last frame after the episode.
     assert len(set(far["true frames"].iou[24:].tolist())) == 1

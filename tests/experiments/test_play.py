@@ -231,11 +231,7 @@ def test_a_picture_is_taken_as_the_project_takes_pictures(open_page) -> None:
     assert answer["done"] == ["brought it from 128x128 to 64x64 pixels"] and not answer["warnings"]
     assert answer["scene"]["own_picture"] and ASKED in answer["scene"]["sentences"]
     assert len(page.ask("imagine", texts=[ASKED])["films"]) == 1
-    for verb, body in (
-        ("do", {"text": ASKED}),
-        ("move", {"thing": 0, "x": 3, "y": 3}),
-        ("plan", {"text": ASKED}),
-    ):
+    for verb, body in (("do", {"text": ASKED}), ("move", {"thing": 0, "x": 3, "y": 3}), ("plan", {"text": ASKED})):
         assert page.refused(verb, **body)
     noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (90, 60, 3), np.uint8))
     noise.save(buffer := io.BytesIO(), "JPEG")

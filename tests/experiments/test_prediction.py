@@ -57,12 +57,7 @@ def test_results_have_every_method_length_and_view(folder: Path) -> None:
 
 def test_the_page_says_what_is_absent_and_shows_both_ends(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    for words in (
-        "LPIPS is absent: no weights here",
-        "JEDi is absent: none there",
-        "SEER is absent",
-        "Quick run",
-    ):
+    for words in ("LPIPS is absent: no weights here", "JEDi is absent: none there", "SEER is absent", "Quick run"):
         assert words in page
     assert "paper, MAGE-DINO" in page and "0.940" in page and "2.59" in page
     files = {str(path.relative_to(folder)) for path in folder.rglob("*.*")}
@@ -85,10 +80,7 @@ def test_jedi_is_taken_over_scenes() -> None:
     rng = np.random.default_rng(0)
     real, imagined = rng.normal(size=(6, 4)), rng.normal(size=(6, 4))
     outcomes = [
-        (
-            FrameScores("ours", {"ssim": np.full(10, i / 10)}, {9: imagined[i]}),
-            FrameScores("truth", {}, {9: real[i]}),
-        )
+        (FrameScores("ours", {"ssim": np.full(10, i / 10)}, {9: imagined[i]}), FrameScores("truth", {}, {9: real[i]}))
         for i in range(6)
     ]
     (row,) = jedi_rows(outcomes)

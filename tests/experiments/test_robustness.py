@@ -197,13 +197,7 @@ def test_the_study_as_a_whole(folder: Path) -> None:
 
 def test_the_page_shows_bars_paper_and_clips(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    for words in (
-        "paper, MAGE-DINO",
-        "37.5 %",
-        "at least 0.75",
-        "LPIPS is absent: no weights here",
-        "Quick run",
-    ):
+    for words in ("paper, MAGE-DINO", "37.5 %", "at least 0.75", "LPIPS is absent: no weights here", "Quick run"):
         assert words in page
     files = {str(path.relative_to(folder)) for path in folder.rglob("*.*")}
     assert {"clips/robustness-best-1.gif", "clips/robustness-worst-1.gif", "plots/drops.png"} <= files

@@ -62,9 +62,7 @@ class ShapeRenderer(Renderer):
         colors_BK3 = slots_BKD[..., 4:7]
         frames_B3HW = torch.einsum("bkhw,bkc->bchw", masks_BKHW, colors_BK3)
         return Rendered(
-            frames_B3HW,
-            masks_BKHW,
-            lambda: colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size),
+            frames_B3HW, masks_BKHW, lambda: colors_BK3[..., None, None].expand(*colors_BK3.shape, self.size, self.size)
         )
 
     def masks(self, slots_BKD: Tensor) -> Tensor:
@@ -157,10 +155,9 @@ class OracleWorldModel:
         """The slots (T, D) of one thing along a path."""
         pixel_T2 = self.camera.project(position_T3)
         unit_T1 = self.camera.metres_per_pixel(pixel_T2, 0.03)[:, None] * 32
-        spread_2 = {
-            BLOCK: np.array([1, 1.2]) * BLOCK_SIZE / 12**0.5,
-            BOWL: np.array([1, 0.85]) * BOWL_RADIUS / 2,
-        }.get(layer, np.array([0.05, 0.05]))
+        spread_2 = {BLOCK: np.array([1, 1.2]) * BLOCK_SIZE / 12**0.5, BOWL: np.array([1, 0.85]) * BOWL_RADIUS / 2}.get(
+            layer, np.array([0.05, 0.05])
+        )
         same_TC = np.tile([layer, *(2 * np.asarray(color) - 1)], (len(position_T3), 1))
         presence_T1 = np.full((len(position_T3), 1), presence)
         parts = [position_T3, same_TC, pixel_T2 / 32 - 1, spread_2 / unit_T1, presence_T1]

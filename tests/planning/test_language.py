@@ -19,12 +19,7 @@ def test_instruction_wants_exactly_one_pair(text: str) -> None:
 def test_goal_of_the_environments_grammar() -> None:
     goal = Goal.parse("put the red block in the blue bowl and the green block in the gray bowl")
     assert goal.instructions == (put_in("red", "blue"), put_in("green", "gray"))
-    assert goal.things == (
-        Thing("red", "block"),
-        Thing("blue", "bowl"),
-        Thing("green", "block"),
-        Thing("gray", "bowl"),
-    )
+    assert goal.things == (Thing("red", "block"), Thing("blue", "bowl"), Thing("green", "block"), Thing("gray", "bowl"))
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,7 @@ import numpy as np
 import pytest
 
 import planning
-from planning import (
-    BeamPlanner,
-    Controller,
-    Goal,
-    GroundingError,
-    Instruction,
-    RandomPlanner,
-)
+from planning import BeamPlanner, Controller, Goal, GroundingError, Instruction, RandomPlanner
 from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 

@@ -13,9 +13,9 @@ from planning import (
     PinholeCamera,
     RandomPlanner,
     Relation,
-    SuccessCriterion,
     Thing,
     measure_rollout,
+    succeeds,
     unmet,
 )
 from tests.planning.conftest import put_in, thing
@@ -76,7 +76,7 @@ def test_a_new_relation_is_planned_scored_and_carried_out(
     assert firsts == {Instruction("beside", a, b) for a in blocks for b in blocks if a != b}, "and none of `in`"
 
     trace = measure_rollout(plan.rollout, plan.grounding, beside)
-    assert trace.within_B.tolist() == [3.0] and SuccessCriterion()(trace).all()
+    assert trace.within_B.tolist() == [3.0] and succeeds(trace).all()
     slots = [list(plan.grounding.slots_of(thing)) for thing in (RED, GREEN)]
     winner_HW = plan.rollout.masks[0, -1].argmax(0)
     red, green = (sum(winner_HW == slot for slot in its).bool() for its in slots)
@@ -107,12 +107,12 @@ def test_one_trace_may_hold_several_relations(
     assert {one.relation for one in grounding.instructions()} == {"in", "on", "beside"}
     assert {one.relation for one in grounding.instructions("in")} == {"in"}
     together = measure_rollout(rollout, grounding, asked)
-    assert together.within_B.tolist() == [4.0, 3.0, 4.0] and SuccessCriterion()(together).all()
+    assert together.within_B.tolist() == [4.0, 3.0, 4.0] and succeeds(together).all()
     for row, one in enumerate(asked):
         alone = measure_rollout(rollout.select(row), grounding, one)
         assert alone.distance_Bt.equal(together.distance_Bt[[row]])
     swapped = measure_rollout(rollout, grounding, asked[::-1])
-    assert SuccessCriterion()(swapped).tolist() == [False, True, False]
+    assert succeeds(swapped).tolist() == [False, True, False]
 
 
 def test_goals_of_several_relations_are_planned(

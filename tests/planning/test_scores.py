@@ -1,22 +1,15 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from planning import (
-    CarryScore,
-    PlacementScore,
-    SuccessCriterion,
-    Thresholds,
-    Trace,
-    WeightedSum,
-    measure,
-    measure_rollout,
-)
+from planning import Thresholds, Trace, measure, measure_rollout, score, succeeds
 from planning.masks import contact_distance
 from planning.relations import RELATIONS
+from planning.scores import carry_score, placement_score
 from tests.planning.conftest import put_in
 from tests.planning.oracle import OracleWorldModel
 
@@ -61,7 +54,7 @@ def test_contact_counts_the_longest_run() -> None:
 
 
 def test_success_wants_both_the_carry_and_the_placement() -> None:
-    criterion = SuccessCriterion(LIMITS)
+    criterion = partial(succeeds, limits=LIMITS)
     assert criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 3])).all()
     assert not criterion(trace([9, 1, 1, 9, 1], [20, 20, 9, 3, 3])).any()  # never three frames in a row
     assert not criterion(trace([9, 1, 1, 1, 9], [20, 20, 9, 3, 5])).any()  # rolled out again
@@ -70,31 +63,25 @@ def test_success_wants_both_the_carry_and_the_placement() -> None:
 
 
 def test_scores_rank_nearer_and_longer_higher() -> None:
-    near, far, lost = (
-        ([9.0] * 4, [9, 9, 1, 1]),
-        ([9.0] * 4, [9, 9, 6, 6]),
-        ([9.0] * 4, [9, 9, float("inf"), 9]),
-    )
-    place = PlacementScore(LIMITS)
+    near, far, lost = (([9.0] * 4, [9, 9, 1, 1]), ([9.0] * 4, [9, 9, 6, 6]), ([9.0] * 4, [9, 9, float("inf"), 9]))
+    place = partial(placement_score, limits=LIMITS)
     assert place(trace(*near)) > 0 > place(trace(*far)) > place(trace(*lost))
     assert torch.isfinite(place(trace(*lost))).all()
-    carry = CarryScore(LIMITS)
+    carry = partial(carry_score, limits=LIMITS)
     assert [carry(trace(arm, [0.0] * 5)).item() for arm in ([9.0] * 5, [9, 1, 9, 9, 9.0], [1.0] * 5)] == [
         pytest.approx(0),
         pytest.approx(1 / 3),
         pytest.approx(1),
     ]
-    both = WeightedSum((place, carry), (3.0, 1.0))
-    assert both(trace(*near)).item() == pytest.approx(0.75 * 0.75)
-    with pytest.raises(ValueError, match="as many weights"):
-        WeightedSum((place,), (1.0, 2.0))
+    ended = trace([1.0] * 12, [0.0] * 12)  # held, and where it should be
+    assert score(ended).item() == pytest.approx(1) and score(trace([9.0] * 12, [0.0] * 12)).item() == pytest.approx(0.8)
 
 
 def test_traces_join_over_steps() -> None:
     joined = trace([9, 1, 1], [9, 9, 9]).then(trace([1, 9, 9], [9, 3, 3]), length=3)
     assert joined.frames == (0, 1, 2, 3, 4, 5)
     assert joined.longest_contact(2).item() == 3
-    assert SuccessCriterion(LIMITS)(joined).all()
+    assert succeeds(joined, LIMITS).all()
 
 
 def test_measure_checks_shapes() -> None:
@@ -110,10 +97,10 @@ def test_the_criterion_tells_the_instruction_from_every_other(oracle: OracleWorl
     assert len(instructions) == 6
     rollout = oracle.rollout(parsed, [i.text for i in instructions])
     for wanted in instructions:
-        verdict = SuccessCriterion()(measure_rollout(rollout, grounding, wanted))
+        verdict = succeeds(measure_rollout(rollout, grounding, wanted))
         assert [i for i, good in zip(instructions, verdict, strict=True) if good] == [wanted]
     each = measure_rollout(rollout, [grounding] * 6, instructions)
-    assert SuccessCriterion()(each).all()
+    assert succeeds(each).all()
     # The frames that a planner looks at lead to the same final distances.
     few = measure_rollout(rollout, grounding, instructions, frames=(0, 4, 8, 12, 16, 20, 23, 24))
     torch.testing.assert_close(few.distance_Bt[:, -1], each.distance_Bt[:, -1])
@@ -128,4 +115,4 @@ def test_a_robot_out_of_sight_holds_nothing(oracle: OracleWorldModel, grounder) 
     grounding = grounder(parsed)
     rollout = oracle.rollout(parsed, [i.text for i in grounding.instructions("in")])
     armless = measure_rollout(rollout, replace(grounding, arm=()), grounding.instructions("in"))
-    assert torch.isinf(armless.contact_Bt).all() and not SuccessCriterion()(armless).any()
+    assert torch.isinf(armless.contact_Bt).all() and not succeeds(armless).any()

@@ -39,13 +39,7 @@ VOTES = replace(
     PLACED,
     name="tiny-votes",
     parser=VotesConfig(
-        image_size=32,
-        num_slots=6,
-        layout=SlotLayout(content=8),
-        hidden=16,
-        crop_cells=8,
-        channels=4,
-        channels_full=4,
+        image_size=32, num_slots=6, layout=SlotLayout(content=8), hidden=16, crop_cells=8, channels=4, channels_full=4
     ),
 )
 

@@ -105,13 +105,7 @@ def test_unknown_words_are_a_warning_line(capsys, tmp_path, checkpoint, picture)
     ],
 )
 def test_mistakes_are_one_line(capsys, tmp_path, checkpoint, picture, changes, part) -> None:
-    given = {
-        "picture": picture,
-        "text": TEXT,
-        "horizon": "2",
-        "out": str(tmp_path / "a.gif"),
-        "checkpoint": checkpoint,
-    }
+    given = {"picture": picture, "text": TEXT, "horizon": "2", "out": str(tmp_path / "a.gif"), "checkpoint": checkpoint}
     given.update(changes)
     arguments = ["rollout", given["picture"], given["text"], "--horizon", given["horizon"]]
     assert part in says(capsys, [*arguments, "--out", given["out"], "--checkpoint", given["checkpoint"]], 1)
@@ -180,10 +174,7 @@ def test_help_teaches(capsys, arguments, parts) -> None:
 
 def test_figures_of_own_frames_are_added_and_nothing_else_changes(capsys, tmp_path, checkpoint) -> None:
     folder, val = Path(checkpoint), write_toy_episodes(tmp_path / "val.h5", [4, 5, 4])
-    before, weights = (
-        json.loads((folder / "config.json").read_text()),
-        (folder / "model.safetensors").read_bytes(),
-    )
+    before, weights = (json.loads((folder / "config.json").read_text()), (folder / "model.safetensors").read_bytes())
     assert cli.main(["measure", checkpoint, "--val", str(val)]) == 0
     after = json.loads((folder / "config.json").read_text())
     assert after["own_frames"]["count"] == 3 and str(folder / "config.json") in capsys.readouterr().out

@@ -64,10 +64,7 @@ def test_a_kind_is_changed_first_and_keeps_what_both_kinds_have() -> None:
         ("predictor.attention=both", "attention is 'both': must be one of window, causal"),
         ("predictor.feed_forwards=true", "must be one of 1, 2"),
         ("parser.kind=random", "parser.kind is 'random': must be one of placed, savi, holistic"),
-        (
-            "renderer.kind=none",
-            "must be one of glimpse, carry, recall, patches, features, broadcast, upsample",
-        ),
+        ("renderer.kind=none", "must be one of glimpse, carry, recall, patches, features, broadcast, upsample"),
         ("text.kind=[1]", "must be one of lexicon, transformer, t5, minilm"),
         ("text.vocabulary=put", "text.vocabulary is 'put': must be a list of strings"),
         ("predictor=2", "is a group; set one of kind, dim"),

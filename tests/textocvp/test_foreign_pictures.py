@@ -50,10 +50,7 @@ def pictures() -> np.ndarray:
 def said(world_model: WorldModel, picture: np.ndarray) -> list[str]:
     """The warnings about a picture, which `rollout` and `parse` agree on."""
     found = []
-    for call in (
-        lambda: world_model.rollout(picture, TEXT, horizon=1),
-        lambda: world_model.parse(picture[None]),
-    ):
+    for call in (lambda: world_model.rollout(picture, TEXT, horizon=1), lambda: world_model.parse(picture[None])):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             call()
@@ -76,11 +73,7 @@ def gray(picture: np.ndarray) -> np.ndarray:
     [
         (gray, "is gray, its three channels are equal", 1.0),
         (lambda picture: picture[..., ::-1], r"has red and blue swapped (BGR): image[..., ::-1]", 1.0),
-        (
-            lambda picture: picture[::-1],
-            "is upside down: image[::-1]",
-            0.5,
-        ),  # the others are redrawn well enough
+        (lambda picture: picture[::-1], "is upside down: image[::-1]", 0.5),  # the others are redrawn well enough
         (np.zeros_like, "is all of one colour: black, as a 0..1 picture cast to uint8", 1.0),
         (lambda picture: np.full_like(picture, 200), "is all of one colour.", 1.0),
     ],
@@ -158,15 +151,7 @@ def test_a_planner_on_another_camera_warns_once(bundled: WorldModel) -> None:
 
 def test_the_command_line_says_it_in_a_line(capsys, tmp_path: Path, pictures: np.ndarray) -> None:
     Image.fromarray(pictures[0][..., ::-1].copy()).save(tmp_path / "bgr.png")
-    arguments = [
-        "rollout",
-        str(tmp_path / "bgr.png"),
-        TEXT,
-        "--horizon",
-        "1",
-        "--out",
-        str(tmp_path / "a.png"),
-    ]
+    arguments = ["rollout", str(tmp_path / "bgr.png"), TEXT, "--horizon", "1", "--out", str(tmp_path / "a.png")]
     assert cli.main(arguments) == 0
     err = capsys.readouterr().err
     assert err.startswith("textocvp: warning: the picture does not look like") and "(BGR)" in err

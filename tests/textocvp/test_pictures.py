@@ -58,12 +58,7 @@ CASES: list[tuple[str, Callable[[np.ndarray, Path], Path], Callable[[np.ndarray]
     ("transparent.png", transparent, with_white_rows, ["put white behind"]),
     ("opaque.png", lambda s, p: saved(p, Image.fromarray(s).convert("RGBA")), lambda s: s, []),
     ("sixteen.png", sixteen, gray_of, ["8 bits a channel", "took its gray"]),
-    (
-        "unit.tiff",
-        lambda s, p: saved(p, Image.fromarray(s[..., 0] / np.float32(255))),
-        gray_of,
-        ["8 bits", "gray"],
-    ),
+    ("unit.tiff", lambda s, p: saved(p, Image.fromarray(s[..., 0] / np.float32(255))), gray_of, ["8 bits", "gray"]),
     ("gray.png", lambda s, p: saved(p, Image.fromarray(s[..., 0])), gray_of, ["took its gray"]),
     ("film.webp", film, lambda s: s, ["the first of its 2 frames"]),
 ]

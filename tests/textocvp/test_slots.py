@@ -5,14 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from textocvp.slots import (
-    PRESENCE_BACKGROUND,
-    PRESENCE_THING,
-    PRESENCE_UNUSED,
-    SlotLayout,
-    SlotState,
-    moments,
-)
+from textocvp.slots import PRESENCE_BACKGROUND, PRESENCE_THING, PRESENCE_UNUSED, SlotLayout, SlotState, moments
 
 LAYOUT = SlotLayout(content=4)
 

@@ -41,12 +41,7 @@ def write_toy_episodes(path: Path, lengths: list[int], seed: int = 0, *, version
         for t in range(length):
             labels = np.zeros((32, 32), np.uint8)
             moved = places[0] + (places[2] - places[0]) * min(1.0, t / (length - 2))
-            for label, (y, x), side in [
-                (4, places[2], 9),
-                (5, places[3], 9),
-                (2, moved, 6),
-                (3, places[1], 6),
-            ]:
+            for label, (y, x), side in [(4, places[2], 9), (5, places[3], 9), (2, moved, 6), (3, places[1], 6)]:
                 labels[int(y) : int(y) + side, int(x) : int(x) + side] = label
             labels[int(moved[0]) : int(moved[0]) + 3, int(moved[1]) : int(moved[1]) + 3] = 1
             palette = np.array([(47, 47, 47), ARM, *(COLORS[name] for name in names)], np.uint8)

@@ -1,7 +1,5 @@
 """CATER-GEN-v2 as its makers distribute it: AVI videos, scenes and captions in one folder (docs/data.md)."""
 
-from __future__ import annotations
-
 import json
 import os
 import warnings

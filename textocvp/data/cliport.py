@@ -1,7 +1,5 @@
 """CLIPort's own episodes, as a folder of npz files: one an episode, without pickled arrays (docs/data.md)."""
 
-from __future__ import annotations
-
 import json
 import os
 import warnings

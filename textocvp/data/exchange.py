@@ -4,8 +4,6 @@ LeRobot's layout is written and read with pyarrow, so that frames stay what they
 its dependencies is needed. Minari's own library writes and reads its sets, without its JPEG encoding.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -33,10 +31,7 @@ CAMERA = "observation.images.rgb"
 OURS = "textocvp/"  # columns of LeRobot's table of episodes that only this program reads
 FILE_BYTES = 100 << 20  # of a data file, as LeRobot's own
 MINARI_NAME = re.compile(r"[-\w.]+-v\d+")
-_INDEX = {
-    "timestamp": "float32",
-    **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64"),
-}
+_INDEX = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
 
 
 def kind_of(source: Path) -> str:
@@ -65,13 +60,7 @@ def kind_of(source: Path) -> str:
 
 
 def import_set(
-    source: Path,
-    out: Path,
-    *,
-    size: int | None = None,
-    crop: bool = False,
-    every: int = 1,
-    camera: str | None = None,
+    source: Path, out: Path, *, size: int | None = None, crop: bool = False, every: int = 1, camera: str | None = None
 ) -> Imported:
     """Write an episode file of a set of LeRobot or Minari, or of npz files. Frames stay as they are, bit for bit.
 
@@ -255,19 +244,8 @@ def _to_lerobot(episodes: EpisodeFile, out: Path, fps: int) -> list[str]:
     parquet.write_table(pa.Table.from_pylist(kept), out / "meta/episodes/chunk-000/file-000.parquet")
     table = pa.table({"task_index": range(len(tasks)), "task": tasks})
     # LeRobot reads it with pandas, and the sentences as the table's index.
-    column = {
-        "name": "task",
-        "field_name": "task",
-        "pandas_type": "unicode",
-        "numpy_type": "object",
-        "metadata": None,
-    }
-    as_pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [column],
-        "pandas_version": "2.0.0",
-    }
+    column = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    as_pandas = {"index_columns": ["task"], "column_indexes": [], "columns": [column], "pandas_version": "2.0.0"}
     parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(as_pandas)}), out / "meta/tasks.parquet")
     return []
 
@@ -342,19 +320,12 @@ def _from_lerobot(source: Path, camera: str | None, done: Imported) -> Iterator[
             frames = np.stack([_picture(source, cell) for cell in table[camera].to_pylist()])
         else:
             name = f"videos/{camera}/"
-            where |= {
-                "chunk_index": row.get(f"{name}chunk_index"),
-                "file_index": row.get(f"{name}file_index"),
-            }
+            where |= {"chunk_index": row.get(f"{name}chunk_index"), "file_index": row.get(f"{name}file_index")}
             begin = round(row.get(f"{name}from_timestamp", 0) * fps)
             frames = film.read(source / info["video_path"].format(**where), begin, row["length"])
         columns: dict[str, Any] = {
             ours: np.array(table[theirs].to_pylist(), np.float32)
-            for ours, theirs in (
-                ("action", "action"),
-                ("state", "observation.state"),
-                ("reward", "next.reward"),
-            )
+            for ours, theirs in (("action", "action"), ("state", "observation.state"), ("reward", "next.reward"))
             if theirs in table.column_names
         }
         for name in ("action", "state"):

@@ -1,7 +1,5 @@
 """Videos of your own, with a sentence each, made into an episode file: `textocvp data` (docs/own-videos.md)."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json
@@ -111,13 +109,7 @@ def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False
 
 
 def _read_videos(
-    source: Path,
-    videos: list[Path],
-    captions: dict[str, str],
-    size: int,
-    crop: bool,
-    every: int,
-    done: Imported,
+    source: Path, videos: list[Path], captions: dict[str, str], size: int, crop: bool, every: int, done: Imported
 ) -> Iterator[Episode]:
     """The videos that can be used; of the others `done` says why."""
     used = 0

@@ -1,7 +1,5 @@
 """Batches read ahead by worker processes, the same ones whatever their number."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar

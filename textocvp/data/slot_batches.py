@@ -6,8 +6,6 @@ video. So a few caption colours become many, and what they share is "the slot wh
 carry no RGB (every text encoder but `lexicon`) nothing is recoloured: "red" would stay "red" while it turns blue.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -3,8 +3,6 @@
 `film.js` and `film.css` beside this file draw a film; `what_if.html` is the page that is sent to others.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -7,18 +7,3 @@ raise `MetricUnavailable`: nothing is computed with random ones.
 from textocvp.metrics.frames import psnr, ssim
 from textocvp.metrics.intervals import Interval, bootstrap_interval, ratio_interval, relative_change, wilson_interval
 from textocvp.metrics.masks import followed, foreground_ari, object_ious, overlaps, slot_labels
-
-__all__ = [
-    "Interval",
-    "bootstrap_interval",
-    "followed",
-    "foreground_ari",
-    "object_ious",
-    "overlaps",
-    "psnr",
-    "ratio_interval",
-    "relative_change",
-    "slot_labels",
-    "ssim",
-    "wilson_interval",
-]

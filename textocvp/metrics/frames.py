@@ -1,7 +1,5 @@
 """Predicted frames against true frames: PSNR and SSIM."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A value and its 95 % interval: rates, means, ratios and relative changes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

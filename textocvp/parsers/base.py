@@ -4,8 +4,6 @@ The published ones have an encoder, an initializer (first frame), a corrector (e
 frames), see SAVi and TextOCVP section 3.1.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the image by region and bind to nothing. With clusters (the idea of clustering-b
 object has a slot from the first step of training. Slots stay exchangeable, and their number stays free at test time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The frozen image encoder of the published CLIPort models: DINOv2 (Oquab et al. 2023), through transformers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 Both packages, network and weights, are Apache-2.0 and the extra `textocvp[efficientnet]`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from pickle import UnpicklingError
 

@@ -5,8 +5,6 @@ which they are (`encoder_fingerprint`). They are read when the first frame is en
 trained on cached features, slots or codes without them.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from pathlib import Path
 from typing import TypeVar

@@ -3,8 +3,6 @@
 Convolutions and an average pooling make one vector of each frame. All that follows is the same as for many slots.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

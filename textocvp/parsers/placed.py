@@ -9,8 +9,6 @@ residual MLP (Locatello et al. 2020), and a transformer block carries the slots 
 channels of the video are permuted: that is what lets training recolour whole scenes in slot space.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ frame -> ConvEncoder -> features -> SlotAttention (corrector) -> slots -> Transi
                                      ^ first frame: GaussianInitializer or clusters
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

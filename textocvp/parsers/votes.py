@@ -8,8 +8,6 @@ in the same way, and their objects handed to the slots by place, size and colour
 one background, or even light. Place, size and colour of a slot are explicit, its content is read as in `placed`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -2,5 +2,3 @@
 
 from textocvp.pictures.draw import SUFFIXES, color_masks, save_film, slot_palette
 from textocvp.pictures.read import bring_to_size, read_picture
-
-__all__ = ["SUFFIXES", "bring_to_size", "color_masks", "read_picture", "save_film", "slot_palette"]

@@ -1,7 +1,5 @@
 """Pictures of rollouts: frames and masks, enlarged, with one stable colour for each slot."""
 
-from __future__ import annotations
-
 import colorsys
 import textwrap
 from collections.abc import Sequence

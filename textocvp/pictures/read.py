@@ -1,7 +1,5 @@
 """Picture files as a model takes them. What has to be changed for that is changed and said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import BinaryIO
 

@@ -1,13 +1,9 @@
 """Predictors: from the slots of some frames and a text to the slots of the next frames. One file each."""
 
-from __future__ import annotations
-
 from textocvp.predictors.base import Imagined, PredictorConfig, SlotPredictor
 from textocvp.predictors.ocvp_seq import OCVPSeqPredictor
 from textocvp.predictors.textocvp import TextOCVPPredictor
 from textocvp.slots import SlotLayout
-
-__all__ = ["PREDICTORS", "Imagined", "PredictorConfig", "SlotPredictor", "build_predictor"]
 
 PREDICTORS: dict[str, type[SlotPredictor]] = {"textocvp": TextOCVPPredictor, "ocvp-seq": OCVPSeqPredictor}
 

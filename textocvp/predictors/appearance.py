@@ -8,8 +8,6 @@ from bags of instances, Maron and Lozano-Perez 1998). While the predictor trains
 a sentence that fits two things does not teach it to move both by half.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

@@ -5,8 +5,6 @@ in other frames. A slot knows another one's past only through what that one carr
 what happens, the predictor can only guess.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """From slots to frames and masks: one file a renderer, and the table that names them."""
 
-from __future__ import annotations
-
 from textocvp.renderers.base import Rendered, Renderer, RendererConfig, Seen
 from textocvp.renderers.broadcast import BroadcastRenderer
 from textocvp.renderers.carry import CarryRenderer
@@ -10,8 +8,6 @@ from textocvp.renderers.patches import FeatureRenderer, PatchRenderer
 from textocvp.renderers.recall import RecallRenderer
 from textocvp.renderers.upsample import UpsampleRenderer
 from textocvp.slots import SlotLayout
-
-__all__ = ["RENDERERS", "Rendered", "Renderer", "RendererConfig", "Seen", "build_renderer"]
 
 RENDERERS: dict[str, type[Renderer]] = {
     "glimpse": GlimpseRenderer,  # a small picture a slot, pasted at the slot's place: the renderer that ships

@@ -1,7 +1,5 @@
 """From slots to frames and masks: what every renderer is."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Every slot is copied to every pixel, given a code of that pixel's place, and dec
 alphas of all slots become masks by a softmax over the slots.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -6,8 +6,6 @@ hid is filled in, the background from the pixels beside the gap, things from the
 draws. Only the robot, which changes its shape, is decoded from its slot.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal

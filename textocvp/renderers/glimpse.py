@@ -4,8 +4,6 @@ A slot that knows its place and size can be described in its own coordinates: th
 it stands (Invariant Slot Attention, Biza et al. 2023).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 

@@ -5,8 +5,6 @@ the paper's reconstructions get sharper for about twice the parameters. Both dou
 frame, at most four times: as published, 24x24 features become 384x384. The result is resized to the size of the frames.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Literal
 

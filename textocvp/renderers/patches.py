@@ -5,8 +5,6 @@ convolutions draw (TextOCVP-DINO). On a CPU `patches` is many times faster than 
 nothing wider than four channels ever exists at pixel resolution.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ So each slot is decoded, as by `glimpse`, and what the first frame showed beyond
 exact outline) goes with the slot, the less the more the slot's picture has changed. What stands still is exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The renderer of Non-OC: one slot holds the whole frame, and convolutions unfold it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Clips of frames, for the stages that learn to redraw them: stage 1 and the VQ-VAE of MAGE."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

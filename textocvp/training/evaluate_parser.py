@@ -3,8 +3,6 @@
 Masks are used for measuring only; nothing here is ever trained on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Other light on the same scene: what a parser that has learned to see must not be disturbed by."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the parser (stage 1) and the predictor (stage 2) are trained for."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

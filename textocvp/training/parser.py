@@ -7,8 +7,6 @@ and the places that the transition expected with those that the corrector found.
 learns from masks that the videos give of themselves, or from those of the simulator (`--teacher masks`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

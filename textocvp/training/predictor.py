@@ -12,8 +12,6 @@ With `--outcome` a second predictor learns, from the first slots of an episode, 
 and the first predictor stay as they are. So a planner can ask where a sentence leads without imagining the way.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

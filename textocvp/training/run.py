@@ -7,8 +7,6 @@ micro-batches whose losses add up to that of the batch. So a run is the same run
 micro-batch or in many, stopped and continued or not.
 """
 
-from __future__ import annotations
-
 import atexit
 import errno
 import fcntl

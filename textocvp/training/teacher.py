@@ -6,8 +6,6 @@ third are the robot, and connected parts of one hue are objects. Where no colour
 unevenly on a gray floor (CATER), the floor's light is a smooth surface, and there is no robot.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

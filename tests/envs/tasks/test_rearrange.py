@@ -124,10 +124,7 @@ def test_a_second_block_in_a_bowl_is_a_block_higher(env: TabletopEnv) -> None:
 
 def test_a_carried_block_passes_over_towers(env: TabletopEnv) -> None:
     """The way of the red block leads through a tower of three."""
-    layout = [
-        block("red", 0.46, -0.15),
-        *(block(c, 0.46, 0.0, k) for k, c in enumerate(("green", "blue", "cyan"))),
-    ]
+    layout = [block("red", 0.46, -0.15), *(block(c, 0.46, 0.0, k) for k, c in enumerate(("green", "blue", "cyan")))]
     layout.append(bowl("gray", 0.46, 0.15))
     env.reset(options={"layout": layout, "instruction": "put the red block in the gray bowl"})
     assert say(env, "put the red block in the gray bowl") == [4, TABLE, 1, 2, TABLE]
@@ -219,12 +216,7 @@ def test_a_seed_draws_a_family_and_is_a_scene(make: Make) -> None:
     seen = {}
     for seed in range(24):
         observation, info = env.reset(seed=seed)
-        seen[seed] = (
-            info["family"],
-            observation["instruction"],
-            observation["goal_rgb"].tobytes(),
-            observation["rgb"],
-        )
+        seen[seed] = (info["family"], observation["instruction"], observation["goal_rgb"].tobytes(), observation["rgb"])
     assert {each[0] for each in seen.values()} == set(FAMILIES)
     for seed in (7, 3):
         observation, info = env.reset(seed=seed)
@@ -336,10 +328,7 @@ SWAP += [bowl("yellow", 0.6, 0.1)]
         ({"instruction": ANY_GOAL}, "an instruction needs a layout here"),
         ({"layout": LAYOUT, "family": "plain"}, "family describe a random scene"),
         ({"layout": LAYOUT, "instruction": "put the red block on the red block"}, "red block on itself"),
-        (
-            {"layout": SWAP, "instruction": "put the red block in the gray bowl"},
-            "already fulfils the instruction",
-        ),
+        ({"layout": SWAP, "instruction": "put the red block in the gray bowl"}, "already fulfils the instruction"),
         (
             {
                 "layout": SWAP,
@@ -362,20 +351,11 @@ SWAP += [bowl("yellow", 0.6, 0.1)]
             "must not name a block twice: a block has room for one block",
         ),
         ({"goal_layout": LAYOUT}, "a goal_layout needs a layout"),
-        (
-            {"layout": LAYOUT, "goal_layout": LAYOUT, "instruction": ANY_GOAL},
-            "stands instead of an instruction",
-        ),
+        ({"layout": LAYOUT, "goal_layout": LAYOUT, "instruction": ANY_GOAL}, "stands instead of an instruction"),
         ({"layout": LAYOUT, "goal_layout": LAYOUT}, "already fulfils"),
+        ({"layout": SWAP, "goal_layout": LAYOUT}, "is a picture of another scene; it must show: gray bowl, green bl"),
         (
-            {"layout": SWAP, "goal_layout": LAYOUT},
-            "is a picture of another scene; it must show: gray bowl, green bl",
-        ),
-        (
-            {
-                "layout": SWAP,
-                "goal_layout": [*SWAP[:2], block("green", 0.6, 0.15, 0, True), bowl("yellow", 0.6, 0.15)],
-            },
+            {"layout": SWAP, "goal_layout": [*SWAP[:2], block("green", 0.6, 0.15, 0, True), bowl("yellow", 0.6, 0.15)]},
             "another scene: in it the yellow bowl stands 0.05 m away",
         ),
         (

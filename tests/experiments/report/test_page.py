@@ -72,19 +72,8 @@ def test_a_browser_shows_it(tmp_path: Path, width: int) -> None:
     page.write_text(examples.report().to_html().replace("</body>", probe + "</body>"), encoding="utf-8")
     assert CHROMIUM is not None
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
-    flags += [
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        "--hide-scrollbars",
-    ]
-    command = [
-        CHROMIUM,
-        *flags,
-        f"--user-data-dir={tmp_path / 'profile'}",
-        f"--window-size={width},900",
-        "--dump-dom",
-    ]
+    flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars"]
+    command = [CHROMIUM, *flags, f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900", "--dump-dom"]
     shown = subprocess.run([*command, page.as_uri()], capture_output=True, text=True, timeout=120)
     found = re.search(r'data-probe="(-?\d+) (\d+) (\d+)"', shown.stdout)
     assert found, shown.stderr[-500:]

@@ -29,11 +29,7 @@ def center(picture: np.ndarray, color: tuple[int, ...]) -> tuple[float, float]:
 
 def test_pictures_stand_in_their_row_and_column() -> None:
     grid = picture_grid(
-        "g.png",
-        [[flat(RED), flat((0, 0, 0, 0))], [flat((0, 0, 0, 0)), flat(BLUE)]],
-        ["a", "b"],
-        ["1", "2"],
-        alt="x",
+        "g.png", [[flat(RED), flat((0, 0, 0, 0))], [flat((0, 0, 0, 0)), flat(BLUE)]], ["a", "b"], ["1", "2"], alt="x"
     )
     light, dark = pixels(grid.light), pixels(grid.dark)
     assert light.shape == dark.shape and light.shape[1] > 900

@@ -37,11 +37,11 @@ def test_results_survive_a_round_trip() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.pop("seeds"), "missing field 'seeds'"),
-        (lambda d: d.update(extra=1), "unknown field 'extra'"),
-        (lambda d: d["rows"][0].pop("n"), "row: missing field 'n'"),
+        (lambda d: d.pop("seeds"), "missing .* 'seeds'"),
+        (lambda d: d.update(extra=1), "unexpected .* 'extra'"),
+        (lambda d: d["rows"][0].pop("n"), "Row.* missing .* 'n'"),
         (lambda d: d["rows"][0].update(value="much"), "finite number"),
-        (lambda d: d["checkpoint"].update(hash=""), "checkpoint: unknown field 'hash'"),
+        (lambda d: d["checkpoint"].update(hash=""), "Checkpoint.* unexpected .* 'hash'"),
     ],
 )
 def test_a_damaged_file_is_named(change, message: str) -> None:

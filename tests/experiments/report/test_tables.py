@@ -118,23 +118,10 @@ def every_row(spec: TableSpec) -> list[Row]:
     ]
 
 
-STUDIES = (
-    ablations,
-    controllability,
-    interpretability,
-    long_horizon,
-    objects,
-    prediction,
-    robustness,
-    runtime,
-)
+STUDIES = (ablations, controllability, interpretability, long_horizon, objects, prediction, robustness, runtime)
 
 
-@pytest.mark.parametrize(
-    "spec",
-    [spec for study in STUDIES for spec in study.STUDY.tables],
-    ids=lambda s: s.title,
-)
+@pytest.mark.parametrize("spec", [spec for study in STUDIES for spec in study.STUDY.tables], ids=lambda s: s.title)
 @pytest.mark.parametrize("width", [80, 120])
 def test_no_figure_is_cut_off(spec: TableSpec, width: int) -> None:
     table = spec.table(every_row(spec))

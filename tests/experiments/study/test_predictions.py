@@ -40,13 +40,7 @@ def predicted(worker: Worker):
 def test_everybody_imagines_the_scene_before_it_is_played(predicted) -> None:
     truth, predictions = predicted
     assert [one.method for one in predictions] == ["ours", "MAGE", "true frames", "wrong text", "copy frame"]
-    assert [len(one.frames_T3HW) for one in predictions] == [
-        25,
-        13,
-        31,
-        25,
-        31,
-    ]  # the double looks 24 frames ahead
+    assert [len(one.frames_T3HW) for one in predictions] == [25, 13, 31, 25, 31]  # the double looks 24 frames ahead
     assert truth.frames_THW3.shape == (31, 64, 64, 3) and (truth.frames_THW3[25:] == truth.frames_THW3[24]).all()
     assert truth.text != truth.wrong_text
     ours, _, true, wrong, copy = (one.frames_T3HW for one in predictions)

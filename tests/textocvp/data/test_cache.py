@@ -102,10 +102,7 @@ def test_what_does_not_belong_is_refused(episodes, numbers, tmp_path) -> None:
         pytest.raises(CacheError, match="made from other episodes"),
     ):
         open_cache(others, folder)
-    with (
-        EpisodeFile(episodes.path, first=3) as fewer,
-        pytest.raises(CacheError, match="made from other episodes"),
-    ):
+    with EpisodeFile(episodes.path, first=3) as fewer, pytest.raises(CacheError, match="made from other episodes"):
         open_cache(fewer, folder)
     (folder / "000002.h5").write_bytes(b"no HDF5")
     with pytest.raises(CacheError, match=r"000002\.h5 is no cache, or damaged"):

@@ -38,10 +38,7 @@ def scene(frames: int = T, last: int = T - 2) -> dict[str, Any]:
     things = [dict(zip(keys, name, strict=True), rotation=12.5) for name in names]
     for i, thing in enumerate(things):
         thing["locations"] = {str(t): [i, -0.25 * t * (i == 0), 0.5] for t in range(frames)}
-    return {
-        "objects": things,
-        "movements": {"Spl": [["_slide", None, 1, last]], "Cone": [["_rotate", None, 0, 7]]},
-    }
+    return {"objects": things, "movements": {"Spl": [["_slide", None, 1, last]], "Cone": [["_rotate", None, 0, 7]]}}
 
 
 def write(folder: Path, count: int = 4, name: str = "train_explicit", codec: str = "mjpeg", **shape: int) -> Path:

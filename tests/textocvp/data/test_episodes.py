@@ -14,14 +14,7 @@ import pytest
 
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.data import FORMATS, open_episodes
-from textocvp.data.episodes import (
-    Episode,
-    EpisodeFile,
-    EpisodeObject,
-    Episodes,
-    Question,
-    swapped_questions,
-)
+from textocvp.data.episodes import Episode, EpisodeFile, EpisodeObject, Episodes, Question, swapped_questions
 
 LENGTHS = (25, 7, 25, 3)
 
@@ -72,10 +65,7 @@ def test_episodes_come_back_whole(path: Path) -> None:
             assert episode.instruction == f"sentence {number}" and episode.seed == 100 + number
             assert episode.success == (number % 2 == 0)
             assert episode.robot == 1 and episode.questions == ()  # the sentence names no object
-            assert episode.objects == (
-                EpisodeObject(0, 2, "block", "red"),
-                EpisodeObject(1, 3, "bowl", "blue"),
-            )
+            assert episode.objects == (EpisodeObject(0, 2, "block", "red"), EpisodeObject(1, 3, "bowl", "blue"))
         assert file.episode(-1).seed == 103 and len(file.frames(-1)) == 3
         assert "4 episodes of split 'val', 64x64" in repr(file)
     with open_episodes(path, first=2) as file:

@@ -243,11 +243,7 @@ def test_what_is_not_allowed_is_said(file: Path, monkeypatch: pytest.MonkeyPatch
 def test_cliports_folders_become_files_with_their_masks(tmp_path: Path) -> None:
     folder, frames = tmp_path / "npz", np.random.default_rng(0).integers(0, 256, (4, 16, 16, 3), np.uint8)
     folder.mkdir()
-    meta = {
-        "caption": "put the red block in the blue bowl",
-        "kinds": ["block", "bowl"],
-        "colors": ["red", "blue"],
-    }
+    meta = {"caption": "put the red block in the blue bowl", "kinds": ["block", "bowl"], "colors": ["red", "blue"]}
     meta |= {"named_blocks": [0], "named_bowls": [1], "task": "x"}
     np.savez(
         folder / "a.npz", frames=frames, segmentation=frames[..., 0] % 4, position=np.zeros((4, 2, 3)),

@@ -17,13 +17,7 @@ import pytest
 
 from textocvp.cli import main
 from textocvp.data import open_episodes
-from textocvp.data.own_videos import (
-    OwnVideosError,
-    contact_sheet,
-    import_videos,
-    problems,
-    read_captions,
-)
+from textocvp.data.own_videos import OwnVideosError, contact_sheet, import_videos, problems, read_captions
 
 PAGE = Path(__file__).parents[3] / "docs/own-videos.md"
 SENTENCES = ("put the red block in the blue bowl", "put the green block in the blue bowl")
@@ -84,17 +78,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, w
     }[what]
     if what == "import lerobot":
         assert (
-            main(
-                [
-                    "data",
-                    "export",
-                    str(tmp_path / "made.h5"),
-                    "--to",
-                    "lerobot",
-                    "--out",
-                    str(tmp_path / "lerobot"),
-                ]
-            )
+            main(["data", "export", str(tmp_path / "made.h5"), "--to", "lerobot", "--out", str(tmp_path / "lerobot")])
             == 0
         )
     if what != "export":

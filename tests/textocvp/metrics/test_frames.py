@@ -22,9 +22,7 @@ def ssim_by_the_formula(x: np.ndarray, y: np.ndarray) -> float:
     window = np.outer(window, window) / window.sum() ** 2
     values = []
     for a, b in zip(
-        np.pad(x, ((0, 0), (5, 5), (5, 5)), "reflect"),
-        np.pad(y, ((0, 0), (5, 5), (5, 5)), "reflect"),
-        strict=True,
+        np.pad(x, ((0, 0), (5, 5), (5, 5)), "reflect"), np.pad(y, ((0, 0), (5, 5), (5, 5)), "reflect"), strict=True
     ):
         A = np.lib.stride_tricks.sliding_window_view(a, (11, 11))
         B = np.lib.stride_tricks.sliding_window_view(b, (11, 11))

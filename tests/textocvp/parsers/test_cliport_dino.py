@@ -99,9 +99,7 @@ def test_both_initialisers_work_on_features(weights: Path, initializer: str) -> 
     assert found.features_BTLF is not None and not found.features_BTLF.requires_grad
     # Features that are known already are as good as frames.
     again = model.parser(
-        torch.zeros(2, 3, 3, 32, 32),
-        features_BTLF=found.features_BTLF,
-        generator=torch.Generator().manual_seed(0),
+        torch.zeros(2, 3, 3, 32, 32), features_BTLF=found.features_BTLF, generator=torch.Generator().manual_seed(0)
     )
     torch.testing.assert_close(again.slots_BTKD, found.slots_BTKD)
     more = model.parser(frames(), num_slots=6)
@@ -202,14 +200,7 @@ def test_both_stages_and_a_rollout(stage_one: Arguments, weights: Path, tmp_path
     assert stored["encoder_weights"] == str(weights) and len(stored["encoder_fingerprint"]) == 64
 
     second = PredictorTraining(
-        cached.data,
-        cached.val,
-        tmp_path / "second",
-        parser=folder,
-        steps=2,
-        batch=2,
-        horizon=2,
-        image_weight=1.0,
+        cached.data, cached.val, tmp_path / "second", parser=folder, steps=2, batch=2, horizon=2, image_weight=1.0
     )
     train_predictor.train(second)
     world = WorldModel.from_pretrained(second.out / "checkpoint")
@@ -280,10 +271,7 @@ def test_choices_that_do_not_fit_are_refused_by_name(weights: Path, tmp_path: Pa
         ("renderer.patches=7", r"renderer\.patches is 7, .* set renderer\.patches=8"),
         ("renderer.feature_dim=8", r"renderer\.feature_dim is 8"),
         ("parser.encoder=conv", r"set .*parser\.encoder=dinov2"),
-        (
-            "parser.kind=placed parser.layout.explicit=true",
-            r"set parser\.kind=savi and parser\.encoder=dinov2",
-        ),
+        ("parser.kind=placed parser.layout.explicit=true", r"set parser\.kind=savi and parser\.encoder=dinov2"),
         ("parser.image_size=30", r"patches of 4 pixels do not divide 30"),
         ("renderer.image_channels=40", r"image_channels"),
     ):

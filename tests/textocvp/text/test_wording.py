@@ -180,14 +180,7 @@ def test_another_script_is_named(shipped: WorldModel, placed_world_model: WorldM
 
 def test_rules_are_for_whole_words_and_longer_wordings_come_first() -> None:
     rules = ("on | on top of => over", "a {x} b {y} => {y} {x}", "please => ")
-    assert reword("Please, button ON top of it; on and on!", rules) == [
-        "button",
-        "over",
-        "it",
-        "over",
-        "and",
-        "over",
-    ]
+    assert reword("Please, button ON top of it; on and on!", rules) == ["button", "over", "it", "over", "and", "over"]
     assert reword("a one two b three", rules) == ["three", "one", "two"]
     assert reword("do a one b two", rules) == ["do", "a", "one", "b", "two"]
 

@@ -41,10 +41,7 @@ def test_word_order_and_every_word_matter(kind):
 
 
 def test_unknown_words_are_named_once_and_in_order():
-    assert encoder("lexicon").unknown_words("Put the Zorble block in the wug bowl, zorble!") == [
-        "zorble",
-        "wug",
-    ]
+    assert encoder("lexicon").unknown_words("Put the Zorble block in the wug bowl, zorble!") == ["zorble", "wug"]
     assert encoder("lexicon").unknown_words("put the turquoise block in the light blue bowl") == []
     assert encoder("transformer").unknown_words("put the red block in the turquoise bowl") == ["turquoise"]
 
@@ -75,15 +72,7 @@ def test_the_vocabulary_is_in_the_configuration():
 
 def test_new_captions_bring_new_words_and_old_ones_keep_their_rows():
     lexicon = WordsConfig(vocabulary=("the", "in", "red")).for_captions(["Stack the red block on the light block"])
-    assert lexicon.vocabulary == (
-        "the",
-        "in",
-        "red",
-        "block",
-        "light",
-        "on",
-        "stack",
-    )  # red has a row already
+    assert lexicon.vocabulary == ("the", "in", "red", "block", "light", "on", "stack")  # red has a row already
     assert lexicon.untrained == ("in",)
     lexicon = WordsConfig().for_captions(["put the red block"], vocabulary=("under", "gray", "put"))
     assert lexicon.vocabulary == ("under", "put", "block", "the")  # red and gray are in the palette

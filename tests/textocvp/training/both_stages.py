@@ -29,15 +29,7 @@ RUNS = {
     "parser, drawn first slots": ["parser", "--preset", PUBLISHED.name],
     "parser, clusters, in parts": ["parser", "--preset", PLACED.name, "--accumulate", "2"],
     "parser, single frames": ["parser", "--preset", PLACED.name, "--clip", "1"],
-    "predictor, causal, image loss": [
-        "predictor",
-        "--horizon",
-        "2",
-        "--image-weight",
-        "1.0",
-        "--parser",
-        PLACED.name,
-    ],
+    "predictor, causal, image loss": ["predictor", "--horizon", "2", "--image-weight", "1.0", "--parser", PLACED.name],
     "predictor, window": ["predictor", "--horizon", "2", "--parser", PUBLISHED.name],
     "vqvae": ["vqvae", "--preset", MAGE.name, "--restart-every", "1", "--stride", "2"],
     "mage": ["mage", "--preset", MAGE.name, "--vqvae", "vqvae/checkpoint"],
@@ -55,11 +47,7 @@ def write_inputs(folder: Path) -> None:
 def main(folder: Path, name: str) -> None:
     """Do every run of `RUNS` into `folder`/`name`, with the command that people use."""
     tiny = {config.name: config for config in (PLACED, PUBLISHED)}
-    with (
-        patch.dict(PRESETS, tiny),
-        patch.dict(MAGE_PRESETS, {MAGE.name: MAGE}),
-        patch.object(training, "LOG_EVERY", 1),
-    ):
+    with patch.dict(PRESETS, tiny), patch.dict(MAGE_PRESETS, {MAGE.name: MAGE}), patch.object(training, "LOG_EVERY", 1):
         for run, command in RUNS.items():
             inputs = {"predictor": folder, "mage": folder / name}  # what the last argument is found in
             if command[0] in inputs:

@@ -14,14 +14,7 @@ from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp.data.cache import cached_slots
 from textocvp.data.episodes import EpisodeFile, Question
 from textocvp.slots import SlotLayout, SlotState
-from textocvp.training.evaluate_predictor import (
-    PIXEL,
-    HeldOut,
-    Trial,
-    Trials,
-    place_and_size,
-    slot_at,
-)
+from textocvp.training.evaluate_predictor import PIXEL, HeldOut, Trial, Trials, place_and_size, slot_at
 
 
 class _Obedient(torch.nn.Module):

@@ -10,15 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from textocvp.training.run import (
-    LOCK_FILE,
-    SETTINGS_FILE,
-    Run,
-    SettingsError,
-    TrainingSettings,
-    close_run,
-    open_run,
-)
+from textocvp.training.run import LOCK_FILE, SETTINGS_FILE, Run, SettingsError, TrainingSettings, close_run, open_run
 
 
 def test_fresh_throws_the_run_away_and_nothing_else(tmp_path: Path) -> None:

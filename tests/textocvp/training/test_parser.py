@@ -12,13 +12,7 @@ import torch
 
 from tests.textocvp.conftest import PLACED, PUBLISHED
 from tests.textocvp.toy_episodes import COLORS, write_toy_episodes
-from tests.textocvp.training.runs import (
-    parser_run,
-    predictor_run,
-    same_weights,
-    train,
-    train_killed_after,
-)
+from tests.textocvp.training.runs import parser_run, predictor_run, same_weights, train, train_killed_after
 from textocvp.data.episodes import EpisodeFile
 from textocvp.metrics import psnr
 from textocvp.model import TextOCVP
@@ -99,15 +93,9 @@ def test_a_checkpoint_knows_how_it_redraws_its_own_frames_and_keeps_that(folder:
     redrawn = WorldModel.from_pretrained(first).parse(frames[:, None]).frames[:, 0]
     real = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
     assert own.count == 2 and own.psnr == pytest.approx(psnr(redrawn, real).mean().item(), abs=0.01)
-    hue, yellow = (
-        np.array(list(bytes.fromhex(own.hue))),
-        np.array(COLORS["yellow"]),
-    )  # the largest that all show
+    hue, yellow = (np.array(list(bytes.fromhex(own.hue))), np.array(COLORS["yellow"]))  # the largest that all show
     assert own.psnr_low <= own.psnr and abs(hue - 255 * yellow / yellow.max()).max() < 4
-    second, third = (
-        predictor_run(folder, "second", parser=first),
-        predictor_run(folder, "third", finetune=True),
-    )
+    second, third = (predictor_run(folder, "second", parser=first), predictor_run(folder, "third", finetune=True))
     train(second)
     train(replace(third, parser=second.out / "checkpoint"))
     for out in (second.out, third.out):

@@ -113,11 +113,7 @@ def test_options_replace_the_checkpoints_choices(folder: Path) -> None:
     settings = ("predictor.color_bias=false", "text.kind=transformer", "predictor.window=6")
     train(run(folder, PLACED, "out", set=settings, steps=1))
     config = TextOCVP.from_pretrained(run(folder, PLACED, "out").out / "checkpoint").config
-    assert (config.predictor.color_bias, config.text.kind, config.predictor.window) == (
-        False,
-        "transformer",
-        6,
-    )
+    assert (config.predictor.color_bias, config.text.kind, config.predictor.window) == (False, "transformer", 6)
     assert config.parser == PLACED.parser
 
 

@@ -6,5 +6,3 @@ random part, as TextOCVP (TMLR 2026) compares itself with it.
 
 from textocvp.baselines.mage.model import Mage, MageConfig, MageVideoModel
 from textocvp.baselines.mage.presets import MAGE_PRESETS, mage_preset
-
-__all__ = ["MAGE_PRESETS", "Mage", "MageConfig", "MageVideoModel", "mage_preset"]

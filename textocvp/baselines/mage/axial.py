@@ -8,8 +8,6 @@ Shape suffixes: B videos, T frames, h and w codes along a side of a frame, g tok
 C width, K codes in the codebook, L words.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

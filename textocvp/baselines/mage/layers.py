@@ -3,8 +3,6 @@
 Shape suffixes: X sequences, N tokens that ask, M tokens that are asked, C width.
 """
 
-from __future__ import annotations
-
 import torch.nn.functional as F
 from torch import Tensor, nn
 

@@ -3,8 +3,6 @@
 Those of MAGE-DINO are from TextOCVP (TMLR 2026), appendix.
 """
 
-from __future__ import annotations
-
 from textocvp.baselines.mage.axial import AxialConfig
 from textocvp.baselines.mage.model import MageConfig
 from textocvp.baselines.mage.text import PublishedTextConfig

@@ -3,8 +3,6 @@
 "Make It Move" (CVPR 2022), section 3.3; its sizes and the order of its norms are those of the published configuration.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -8,8 +8,6 @@ the next frame's codes. In the last updates it also learns from frames that it i
 does here (dataset aggregation, Ross et al. 2011); with `--autoregressive 0` it is trained as published.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

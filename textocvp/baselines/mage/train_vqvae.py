@@ -6,8 +6,6 @@ The loss is the squared error of the redrawn frame, things weighted above the ca
 and features to each other ("Neural Discrete Representation Learning" 2017, equation 3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -5,8 +5,6 @@
 Shape suffixes: N frames, H and W pixels, h and w codes along a side, C width of a code, K codes in the codebook.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from math import exp
