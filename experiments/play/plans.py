@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from planning import Goal, Instruction, PictureGoal, Plan, Thing, places, seen_supports
+from planning import Foresees, Goal, Instruction, PictureGoal, Plan, Thing, places, seen_supports
 from planning.grounding import Grounding
-from textocvp import Rollout, WorldModel
+from textocvp import Rollout
 from textocvp.film_page import picture_url
 
 BRANCHES = 12  # sequences of sentences that the tree shows
@@ -17,7 +17,7 @@ BRANCHES = 12  # sequences of sentences that the tree shows
 Said = tuple[Instruction, ...]  # one after another
 
 
-def plan_data(world_model: WorldModel, rgb: np.ndarray, goal: Goal | PictureGoal, plan: Plan) -> dict[str, Any]:
+def plan_data(world_model: Foresees, rgb: np.ndarray, goal: Goal | PictureGoal, plan: Plan) -> dict[str, Any]:
     """A plan that was made from a picture (H, W, 3), without its films; all of it can be written as JSON."""
     shown = [one.instructions for one in plan.ranking[:BRANCHES]]
     known = {one.instructions: one for one in plan.ranking}
@@ -46,7 +46,7 @@ def plan_data(world_model: WorldModel, rgb: np.ndarray, goal: Goal | PictureGoal
 
 
 def imagined_ends(
-    world_model: WorldModel, rgb: np.ndarray, paths: Sequence[Said]
+    world_model: Foresees, rgb: np.ndarray, paths: Sequence[Said]
 ) -> dict[Said, tuple[np.ndarray, Rollout]]:
     """Where sequences of sentences, and all their beginnings, are imagined to lead: a picture and the slots."""
     level: dict[Said, Rollout] = {(): world_model.parse(rgb[None])}
@@ -65,7 +65,7 @@ def imagined_ends(
     return ends
 
 
-def _obvious(world_model: WorldModel, rgb: np.ndarray, goal: Goal, grounding: Grounding) -> dict[str, Any]:
+def _obvious(world_model: Foresees, rgb: np.ndarray, goal: Goal, grounding: Grounding) -> dict[str, Any]:
     """The goal's own sentences, one after another: where they are imagined to lead, and what is wrong with that."""
     asked, things = goal.instructions, sorted(grounding.things)
     frame, end = imagined_ends(world_model, rgb, [asked])[asked]

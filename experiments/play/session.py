@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +19,14 @@ from experiments.play.links import Link, Refused
 from experiments.play.plans import plan_data
 from experiments.play.tabletop import Tabletop, slot_names
 from experiments.play.worlds import Choice
-from planning import Foresees, Goal, PictureGoal, SearchPlanner
+from experiments.study.foresight import foresight
+from planning import Goal, PictureGoal, SearchPlanner
 from textocvp import Rollout, WorldModel
 from textocvp.film_page import film_data, picture_url, save_page
 from textocvp.pictures import SUFFIXES, read_picture, save_film
 
 MOST_SENTENCES = 12  # side by side
+FILMS = 60  # of a plan by a model that foresees no outcome in one step
 MOST_PIXELS = 50_000_000  # of a picture, which are unpacked to four bytes each
 
 
@@ -100,9 +102,7 @@ class Session:
 
     def about(self) -> dict[str, Any]:
         """What the page must know of the world: what can be done there."""
-        edits = isinstance(self.world, Tabletop)
-        plans = edits and self.world_model.foresees
-        return {"edits": edits, "plans": plans, "families": list(self.world.families)}
+        return {"edits": isinstance(self.world, Tabletop), "families": list(self.world.families)}
 
     def view(self) -> dict[str, Any]:
         """The scene as the page shows it."""
@@ -234,7 +234,7 @@ class Session:
         true = False
         with suppress(ValueError):  # what the goal names may have been taken away
             true = self._is_reached(self.goal)
-        seen = self._planner.reached(self.table.rgb, self.goal, self.table.grounder)
+        seen = self._planner(self.goal).reached(self.table.rgb, self.goal, self.table.grounder)
         return {"reached": {"seen": seen, "true": true}}
 
     def _is_reached(self, goal: Goal | PictureGoal) -> bool:
@@ -242,9 +242,12 @@ class Session:
             return tuple(self.table.info["supports"]) == self.goal_supports
         return self.table.is_reached(goal)
 
-    @property
-    def _planner(self) -> SearchPlanner:
-        return SearchPlanner(cast(Foresees, self.world_model))
+    def _planner(self, goal: Goal | PictureGoal) -> SearchPlanner:
+        model = foresight(self.world_model)
+        if self.world_model.foresees:
+            return SearchPlanner(model)
+        # Whole films take long, so only plans as short as the goal allows.
+        return SearchPlanner(model, budget=FILMS, depth=goal.steps)
 
     def plan(self, text: str) -> dict[str, Any]:
         """Search for the goal of a sentence, or for the one that was arranged where there is no sentence."""
@@ -253,21 +256,16 @@ class Session:
         goal = Goal.parse(text) if text.strip() else self.goal
         if goal is None:
             raise Refused("say what the goal is, or arrange it")
-        if not self.world_model.foresees:
-            raise Refused(
-                f"the checkpoint {self.world_model.checkpoint.name} cannot foresee where sentences lead, which a "
-                "plan is made of; tabletop-small can"
-            )
         self._is_reached(goal)
         self.goal = goal
         state = self.goal_state()
         if state["reached"]["seen"]:
             return {"done": True, **state}
-        plan = self._planner.plan(table.rgb, goal, table.grounder)
+        plan = self._planner(goal).plan(table.rgb, goal, table.grounder)
         names = slot_names(plan.grounding)
         self.shown = [Shown(one, names) for one in plan.rollouts]
         films = [film_data(one, (), names) for one in plan.rollouts]
-        return {"done": False, "films": films, **plan_data(self.world_model, table.rgb, goal, plan)}
+        return {"done": False, "films": films, **plan_data(foresight(self.world_model), table.rgb, goal, plan)}
 
     def _check_scene(self) -> None:
         if self.picture is not None:

@@ -26,7 +26,6 @@ from envs.cater import Table
 from envs.splits import SPLITS
 from experiments.study.cater import CaterScene
 from planning import PinholeCamera
-from tests.textocvp.conftest import PLACED, build
 from textocvp import WorldModel, cli
 
 TestClient = pytest.importorskip("fastapi.testclient", exc_type=ImportError).TestClient
@@ -34,7 +33,7 @@ TestClient = pytest.importorskip("fastapi.testclient", exc_type=ImportError).Tes
 from experiments.play import __main__ as command  # noqa: E402
 from experiments.play import server  # noqa: E402
 from experiments.play.links import Link, Refused  # noqa: E402
-from experiments.play.session import Session, heard  # noqa: E402
+from experiments.play.session import FILMS, Session, heard  # noqa: E402
 from experiments.play.worlds import WORLDS  # noqa: E402
 
 HORIZON = 24
@@ -378,13 +377,18 @@ def test_memory_does_not_grow(world_model) -> None:
         assert resident() - before < 8 * 2**20  # after 210 requests
 
 
-def test_a_model_without_foresight_says_so() -> None:
-    tiny = WorldModel(build(PLACED))
-    with TestClient(server.create_app(tiny, WORLDS["tabletop"], horizon=3)) as client:
+def test_a_model_without_foresight_plans_by_films(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, films = WorldModel.from_pretrained("tabletop-small-40"), list[int]()
+    rollout = model.rollout
+    monkeypatch.setattr(model, "rollout", lambda obs, text, **how: films.append(len(text)) or rollout(obs, text, **how))
+    with TestClient(server.create_app(model, WORLDS["tabletop"], horizon=3)) as client:
         page = Page(client)
         sentence = page.opened["scene"]["sentences"][0]
         assert page.ask("imagine", texts=[sentence])["films"][0]["count"] == 4
-        assert "cannot foresee" in page.refused("plan", text=sentence)
+        films.clear()
+        answer = page.ask("plan", text=sentence)
+        assert len(answer["sentences"]) == 1 and all(node["depth"] == 1 for node in answer["tree"])
+        assert len(page.opened["scene"]["sentences"]) <= sum(films) <= 2 * FILMS
         assert "no families" in page.refused("scene", query="family=plain")
 
 
@@ -426,7 +430,7 @@ def open_cater(cater_model: WorldModel) -> Iterator[Callable[..., Page]]:
 def test_a_scene_of_cater_is_imagined_and_done_as_its_simulator_draws_it(open_cater, cater_model) -> None:
     page = open_cater("seed=3")
     about, scene = page.opened["about"], page.opened["scene"]
-    assert not about["edits"] and not about["plans"] and not about["families"]
+    assert not about["edits"] and not about["families"]
     truth = CaterScene("test", SPLITS["test"].seed(3))
     frames, _ = truth.watch(64)
     own = truth.clip().instruction
