@@ -13,7 +13,7 @@ because that term alone could decide. Writes `results.json`, `report.html`, plot
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class AttentionScene:
 
     def run(self, worker: Worker) -> AttentionOutcome:
         """Imagine, name the slots, read the attention."""
-        model = cast(WorldModel, worker.world_model)
+        model = worker.world_model
         sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
         parsed = model.parse(sampled.observation["rgb"][None], seed=self.seed)
         present_K = parsed.presence[0, 0].numpy() >= 0.5
@@ -176,7 +176,7 @@ class AttentionPicture:
         sampled = sample_scene(worker.environment(self.scene), self.scene, self.variants)
         parsed = worker.world_model.parse(sampled.observation["rgb"][None], seed=self.seed)
         text, kind = sampled.texts[self.variant], "best" if self.best else "worst"
-        (attention_TnhKW,), rollout = imagine(cast(WorldModel, worker.world_model), parsed, [text], self.seed)
+        (attention_TnhKW,), rollout = imagine(worker.world_model, parsed, [text], self.seed)
         frames_THW3, masks_TKHW = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
         shares_TKW = attention_TnhKW.mean((1, 2))
         glowing = [glow(frames_THW3, masks_TKHW, shares_TKW[..., word]) for word in COLOR_WORDS]

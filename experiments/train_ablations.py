@@ -9,8 +9,6 @@ it afterwards. Stop at any moment and start again: finished runs are skipped, an
 The episodes are parsed once, and all predictor runs share those slots.
 """
 
-import os
-import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -121,7 +119,7 @@ def train(run: AblationRun, args: Args, parser: Path) -> None:
 
 
 def share_slots(parser: Path, args: Args, out: Path) -> None:
-    """Put the slots of all episodes into a run's folder; they are parsed for the first run only.
+    """Link the slots of all episodes into a run's folder; they are parsed for the first run only.
 
     Raises:
         CacheError: if the shared slots are those of another parser or of other episodes.
@@ -131,15 +129,8 @@ def share_slots(parser: Path, args: Args, out: Path) -> None:
     for name, path, first in zip(SLOTS, (args.data, args.val), (args.episodes, None), strict=True):
         with open_episodes(path, first=first) as episodes:
             cached_slots(model, episodes, shared / name)
-        shutil.rmtree(out / name, ignore_errors=True)
-        shutil.copytree(shared / name, out / name, copy_function=_link)
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # a file system without hard links
-        shutil.copyfile(source, target)
+        if not (out / name).exists():
+            (out / name).symlink_to((shared / name).absolute())
 
 
 if __name__ == "__main__":

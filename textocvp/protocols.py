@@ -1,7 +1,7 @@
 """What others may ask of a model, and how they get one.
 
-A `VideoModel` imagines frames, with slots or without. A `SlotModel` also gives its slots, as `WorldModel` does.
-Whatever has these methods is one, so a study that asks for no more also runs on a test double.
+A `VideoModel` imagines frames, with slots or without. Whatever has its methods is one, so a study that asks for no more
+also runs on a test double.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from textocvp.baselines import BASELINES
 from textocvp.checkpoint import DEFAULT_CHECKPOINT, Checkpoint, read_json, resolve_checkpoint
-from textocvp.rollout import Rollout
 from textocvp.world_model import WorldModel
 
 Model = TypeVar("Model", covariant=True)
@@ -50,27 +49,6 @@ class VideoModel(Protocol):
         Raises:
             TypeError, ValueError: as `WorldModel.rollout`.
         """
-
-
-class SlotModel(VideoModel, Protocol):
-    """A video prediction model with slots; its methods are described in `WorldModel`."""
-
-    def parse(self, video: np.ndarray, *, seed: int = 0) -> Rollout:
-        """The slots of a true video (T, H, W, 3)."""
-
-    def rollout(
-        self,
-        obs: Mapping[str, Any] | np.ndarray | Rollout,
-        text: str | Sequence[str],
-        *,
-        horizon: int = 24,
-        seed: int = 0,
-        attention: bool = False,
-    ) -> Rollout:
-        """Imagine the next frames."""
-
-    def words(self, text: str) -> list[str]:
-        """What the last axis of `Rollout.attention` stands for."""
 
 
 class LoadModel(Protocol[Model]):

@@ -12,7 +12,8 @@ from joblib import cpu_count as available_cores  # noqa: F401 - for the studies
 
 from experiments.study.scenes import StudyScene
 from textocvp.protocols import LoadCheckpoint as LoadCheckpoint
-from textocvp.protocols import LoadModel, SlotModel
+from textocvp.protocols import LoadModel
+from textocvp.world_model import WorldModel
 
 Out = TypeVar("Out", covariant=True)
 Model = TypeVar("Model")
@@ -22,7 +23,7 @@ Model = TypeVar("Model")
 class Worker:
     """What a unit of work may use, made once a process."""
 
-    world_model: SlotModel  # the study's own
+    world_model: WorldModel  # the study's own
     _environments: dict[Any, gym.Env[Any, Any]] = field(default_factory=dict)
     _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
 

@@ -30,7 +30,8 @@ from experiments.study.methods import METHODS, find_models
 from experiments.study.pool import Pool, Unit, available_cores
 from experiments.study.scenes import scene_line
 from textocvp.checkpoint import CheckpointError
-from textocvp.protocols import LoadCheckpoint, LoadModel, SlotModel
+from textocvp.protocols import LoadCheckpoint, LoadModel
+from textocvp.world_model import WorldModel
 
 RESULTS = Path("results")  # where every study writes by default
 LARGEST_SEED = 999  # each seed has scenes of its own, and a split has so many
@@ -203,7 +204,7 @@ class Run:
         self.folder = OutputFolder(args.folder(study.name))
         self.sizes = study.sizes(args) if sizes is None else sizes
         self.load: LoadModel[Any] = load or LoadCheckpoint(args.checkpoint)
-        self.world_model = cast(SlotModel, self.load())
+        self.world_model = cast(WorldModel, self.load())
         if not hasattr(self.world_model, "rollout"):
             raise UsageError(f"{args.checkpoint} has no slots, and a study needs a model that has")
         longest = self.world_model.longest_horizon

@@ -23,15 +23,14 @@ class ParserLoss:
     """The terms of stage 1, each a scalar, 0 where a model has nothing to compare."""
 
     image: Tensor  # `image_loss` of the redrawn frames
-    mask: Tensor  # `mask_loss`
+    mask: Tensor  # `mask_loss`, the agreement between drawn masks and attention
     place: Tensor  # `place_loss`; for slots without explicit places `read_place_loss`
     feature: Tensor  # mean squared error of the reconstructed features
     lesson: Tensor  # what a parser that is taught gets wrong
 
-    def total(self, mask_weight: float, place_weight: float, feature_weight: float) -> Tensor:
+    def total(self) -> Tensor:
         """The weighted sum that is minimised."""
-        learned = self.image + mask_weight * self.mask + place_weight * self.place
-        return learned + feature_weight * self.feature + self.lesson
+        return self.image + 0.1 * self.mask + 0.1 * self.place + self.feature + self.lesson
 
 
 def thing_weights(target: Tensor, thing_weight: float) -> Tensor:
@@ -90,9 +89,9 @@ class SlotLoss:
     scale: Tensor  # squared error of the log-scale, in tenths
     content: Tensor  # squared error of the content, or of the whole slot if it has no explicit channels
 
-    def total(self, scale_weight: float, content_weight: float) -> Tensor:
+    def total(self, content_weight: float) -> Tensor:
         """The weighted sum that is minimised."""
-        return self.position + scale_weight * self.scale + content_weight * self.content
+        return self.position + 0.1 * self.scale + content_weight * self.content
 
 
 def slot_loss(

@@ -42,12 +42,6 @@ class ParserTraining(ClipTraining):
     steps: int = 2000
     learning_rate: float = 4e-4
     warmup: int = 300
-    mask_weight: float = 0.1
-    """Weight of the agreement between drawn masks and attention."""
-    place_weight: float = 0.1
-    """Weight of the transition's error in place, or of the error of the places that the renderer reads."""
-    feature_weight: float = 1.0
-    """Weight of the error of reconstructed features (renderer `features` only)."""
     teacher: Literal["video", "masks"] = "video"
     """Who says what pixels show (parser `votes` only): the videos themselves, or the masks of the episodes."""
     first_redraw: int = 0
@@ -165,8 +159,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                     lesson=None if lesson is None else (lesson[0][part], lesson[1][part]),
                     redraw=step >= args.first_redraw,
                 )
-                total = loss.total(args.mask_weight, args.place_weight, args.feature_weight)
-                run.backward(total, vars(loss))
+                run.backward(loss.total(), vars(loss))
             run.update(step)
             run.evaluate(step, measure, lambda path: draw_samples(model, held_out, path))
 

@@ -71,15 +71,11 @@ class PredictorTraining(TrainingSettings):
     """Frames of the first rollouts; grows linearly to the whole episode at four fifths of these updates."""
     moving: float = 20.0
     """How much more a slot counts that moves."""
-    scale_weight: float = 0.1
-    """Weight of the error in size."""
     content_weight: float = 0.3
     """Weight of the error in content."""
     words_first: int = 0
     """Updates, the first ones, that learn only which slots act by the words: they are quick, and what slots then do
     is learned sooner."""
-    words_weight: float = 1.0
-    """Weight of what the words say of which slots act, where they are matched with what slots look like."""
     image_weight: float = 0.0
     """Weight of the error of drawn frames of rollouts; its gradient flows through the frozen renderer."""
     image_frames: int = 2
@@ -221,7 +217,7 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
                 predicted_BSKD = predicted_BSKD.float()
                 loss = slot_loss(predicted_BSKD, target_BSKD, weights, layout, std_C)
                 words_loss = run.weight(rows) * words_loss
-                total = loss.total(args.scale_weight, args.content_weight) + args.words_weight * words_loss
+                total = loss.total(args.content_weight) + words_loss
                 if args.image_weight > 0:
                     times_BF = every * (first + drawn_BF[rows])
                     true_BF3HW = true_frames(episodes, batch.episodes_B[rows], times_BF, batch.channels_B3[rows])

@@ -137,7 +137,7 @@ def test_stage_one_reaches_every_parameter(initializer: str, prior: str) -> None
     frames[:, :, 2, 18:26, 10:16] = 0.8
     loss = ParserStage(model)(frames, thing_weights(frames.flatten(0, 1), 4.0))
     assert (loss.place > 0) == (prior == "true") and loss.mask == 0
-    loss.total(0.1, 0.1, 0.0).backward()
+    loss.total().backward()
     for name, parameter in [*model.parser.named_parameters(), *model.renderer.named_parameters()]:
         assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
 

@@ -25,6 +25,9 @@ from textocvp.training.clips import Clips, ClipTraining, clip_reader, save_sampl
 from textocvp.training.losses import thing_weights
 from textocvp.training.run import Metrics, Run, allowed_settings, close_run, open_data, open_run
 
+COMMITMENT = 2.0  # weight of the term that draws features to their codes (published)
+RESTART_UNTIL = 0.7  # share of the updates after which codes are left where they are
+
 
 @dataclass(kw_only=True)
 class VQVAETraining(ClipTraining):
@@ -38,12 +41,8 @@ class VQVAETraining(ClipTraining):
     warmup: int = 100
     clip: int = 4
     stride: int = 6
-    commitment: float = 2.0
-    """Weight of the term that draws features to their codes (published)."""
     restart_every: int = 25
     """Updates after which codes that none of them used are put where the features are."""
-    restart_until: float = 0.7
-    """Share of the updates after which codes are left where they are."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
 
         reader = clip_reader(run, args, episodes, model.dino)
         for step, clips in reader.steps(run, "vqvae"):
-            if step % args.restart_every == 0 and step <= args.restart_until * args.steps:
+            if step % args.restart_every == 0 and step <= RESTART_UNTIL * args.steps:
                 # Every process looks at the same whole batch, so that all of them move the same codes alike.
                 restart_codes(model, uses, replace(reader, rows=slice(None))(step), args.seed + step)
             frames_BT3HW, features_BTLF = clips.on(run.device)
@@ -112,7 +111,7 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
                 image = (weights_N1HW * (drawn_N3HW - frames_N3HW).square()).sum() / (3 * whole)
                 terms = (found.codebook_loss, found.commitment_loss)
                 codebook, commitment = (run.weight(part) * term for term in terms)
-                total = image + codebook + args.commitment * commitment
+                total = image + codebook + COMMITMENT * commitment
                 run.backward(total, {"image": image, "commitment": commitment})
                 counts_K += found.codes_Nhw.flatten().bincount(minlength=len(counts_K))
             counts_K = run.total(counts_K).cpu()
