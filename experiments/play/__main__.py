@@ -25,8 +25,9 @@ class PlayCommand:
     checkpoint: str | None = None
     """A bundled name, a folder, or a Hugging Face hub id owner/name; by default the one that knows the world."""
     world: Literal["rearrange", "tabletop", "cliport", "cater"] = "rearrange"
-    """rearrange: blocks into bowls and onto blocks. tabletop: into bowls. cliport: the same on CLIPort's table, with plans
-    of no more sentences than the goal has parts. cater: CATER's table, on which things move by themselves: scenes and captions, but nothing to arrange and no plans."""
+    """rearrange: blocks into bowls and onto blocks. tabletop: into bowls. cliport: the same on CLIPort's table, with
+    plans of no more sentences than the goal has parts. cater: CATER's table, on which things move by themselves: scenes
+    and captions, but nothing to arrange and no plans."""
     port: int = 7860
     """Where to listen; 0 takes a free one."""
     host: str = "127.0.0.1"
