@@ -93,10 +93,10 @@ def test_jedi_is_taken_over_scenes() -> None:
 
 
 def test_what_cannot_be_measured_has_a_reason(tmp_path: Path) -> None:
-    found = available_measures(str(tmp_path), (9,))
+    found = available_measures(jedi=str(tmp_path), jedi_lengths=(9,))
     assert found.jedi is None and dict(found.reasons)["jedi"].startswith("JEDi needs weights of V-JEPA 2")
     assert "st_lpips" in found.metrics
-    assert "JEDi is absent: a reason." in available_measures(None, (9,), "a reason").absent
+    assert "JEDi is absent: a reason." in available_measures(jedi_lengths=(9,), without_jedi="a reason").absent
 
 
 def test_a_number_of_scenes_below_0_is_refused() -> None:
