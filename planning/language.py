@@ -11,7 +11,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import is_color_like
 from numpy.typing import NDArray
 
 from .relations import RELATIONS
@@ -150,6 +149,8 @@ def _parse(text: str) -> tuple[Instruction, ...]:
             raise ValueError(
                 f"cannot read {words!r} in the goal {text!r}; it takes {_forms()}, several joined by 'and'"
             )
+    from matplotlib.colors import is_color_like  # takes longer to import than all of the planner
+
     for thing in (thing for one in found for thing in one.things):
         # Names of CSS, and of the XKCD survey.
         if not (is_color_like(thing.color) or is_color_like(f"xkcd:{thing.color}")):

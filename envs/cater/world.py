@@ -6,9 +6,9 @@ from math import cos, pi, sin
 
 import numpy as np
 import pybullet as p
+import scipy  # its parts are loaded when they are first used
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
-from scipy.spatial import ConvexHull
 
 from ..physics.camera import Camera, CameraPreset
 from ..physics.shapes import Mesh, lathed
@@ -103,7 +103,7 @@ class Table:
             points = _rotated(thing.radius * _outline(thing.shape), turn) + center
             points = points - np.maximum(points[:, 2:], 0) * (self.light / self.light[2])
             shadow = drawn.project(points)
-            draw.polygon(shadow[ConvexHull(shadow).vertices].ravel().tolist(), fill=255)
+            draw.polygon(shadow[scipy.spatial.ConvexHull(shadow).vertices].ravel().tolist(), fill=255)
         soft = np.asarray(picture.filter(ImageFilter.GaussianBlur(SOFT * size)), np.float32) / 255
         floor: NDArray[np.float32] = _empty_floor(size) * (1 - np.float32(SHADE) * soft)
         return floor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import ipaddress
 import socket
 import sys
@@ -9,9 +10,12 @@ import threading
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 
 class Mistake(Exception):
@@ -59,11 +63,37 @@ def serve(command: PlayCommand) -> None:
     if command.most_pages < 1:
         raise Mistake(f"--most-pages must be at least 1, not {command.most_pages}")
     listening = listen(command.host, command.port)
-    # Loaded only now, because it takes seconds.
+    gc.disable()  # loading takes seconds, and a tenth more where somebody looks for garbage meanwhile
+    try:
+        app = load(command)
+    finally:
+        gc.enable()
+    host, port = listening.getsockname()[:2]
+    alone = is_loopback(host)
+    shown = f"[{host}]" if ":" in host else host
+    url = f"http://{shown if alone else socket.gethostname()}:{port}/"
+    print(f"textocvp play: {url} (Ctrl-C ends it)", flush=True)
+    if alone:  # a page of another host that calls itself by a name for this one is not answered
+        # Of an IPv6 address older versions of Starlette see no more than "[", which no other host is called.
+        from fastapi.middleware.trustedhost import TrustedHostMiddleware
+
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[shown, "localhost", *(["["] if ":" in host else [])])
+    else:
+        said = f"--host {command.host}: everyone who reaches this machine over the network can open the page"
+        print(f"textocvp: {said}, without a password", file=sys.stderr, flush=True)
+    if command.browser:
+        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+    import uvicorn
+
+    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
+    uvicorn.Server(config).run(sockets=[listening])
+
+
+def load(command: PlayCommand) -> FastAPI:
+    """The page with its model; a Mistake where a package or the checkpoint is missing."""
     try:
         import torch
-        import uvicorn
-        from fastapi.middleware.trustedhost import TrustedHostMiddleware
+        import uvicorn  # noqa: F401
 
         from experiments.play.server import create_app
         from experiments.play.worlds import WORLDS
@@ -80,22 +110,7 @@ def serve(command: PlayCommand) -> None:
         world_model = WorldModel.from_pretrained(command.checkpoint or choice.checkpoint)
     except CheckpointError as error:
         raise Mistake(str(error)) from None
-    app = create_app(world_model, choice, command.most_pages)
-    host, port = listening.getsockname()[:2]
-    alone = is_loopback(host)
-    shown = f"[{host}]" if ":" in host else host
-    url = f"http://{shown if alone else socket.gethostname()}:{port}/"
-    print(f"textocvp play: {url} (Ctrl-C ends it)", flush=True)
-    if alone:  # a page of another host that calls itself by a name for this one is not answered
-        # Of an IPv6 address older versions of Starlette see no more than "[", which no other host is called.
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[shown, "localhost", *(["["] if ":" in host else [])])
-    else:
-        said = f"--host {command.host}: everyone who reaches this machine over the network can open the page"
-        print(f"textocvp: {said}, without a password", file=sys.stderr, flush=True)
-    if command.browser:
-        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
-    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
-    uvicorn.Server(config).run(sockets=[listening])
+    return create_app(world_model, choice, command.most_pages)
 
 
 def listen(host: str, port: int) -> socket.socket:

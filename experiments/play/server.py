@@ -112,11 +112,23 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
                 await asyncio.sleep(30)
                 await run_in_threadpool(sessions.sweep)
 
-        sweeping = asyncio.create_task(sweep())
+        async def warm_up() -> None:  # the first film takes a second longer than all others: let nobody wait for it
+            def imagine() -> None:
+                with heard(), suppress(Exception):  # what fails is said to the person whom it fails
+                    session = sessions.make(Link())
+                    try:
+                        session.imagine(session.world.sentences(None)[:1])
+                    finally:
+                        session.close()
+
+            await run_in_threadpool(imagine)
+
+        aside = [asyncio.create_task(sweep()), asyncio.create_task(warm_up())]
         yield
-        sweeping.cancel()
-        with suppress(asyncio.CancelledError):
-            await sweeping
+        for task in aside:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
         for name in list(sessions.open):
             sessions.close(name)
 

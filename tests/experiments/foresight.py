@@ -56,7 +56,7 @@ class Foresight(oracle.StudyOracle):
 
     def _future(self, seed: int) -> Rollout:
         """What the expert would do now, with the scene put back afterwards."""
-        env, reset = oracle._history[0]["env"], oracle._history[0]["reset"]
+        env, reset = oracle._history[0]["env"](), oracle._history[0]["reset"]
         for action in Expert(env).actions():
             env.step(action)
         frames = sum(len(info["frame_states"]["object_position"]) for info in oracle._history)

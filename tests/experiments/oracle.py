@@ -6,6 +6,7 @@ since. That is cheating on purpose: the studies can then be proven without a tra
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +34,8 @@ def _listen() -> None:
 
     def heard_reset(self: TabletopEnv, *, seed: int | None = None, options: Any = None) -> Any:
         result = reset(self, seed=seed, options=options)
-        _history[:] = [{**result[1], "env": self, "reset": {"seed": seed, "options": options}}]
+        # A weak reference: what a test drops must be free to end.
+        _history[:] = [{**result[1], "env": weakref.ref(self), "reset": {"seed": seed, "options": options}}]
         return result
 
     def heard_step(self: TabletopEnv, action: Any) -> Any:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
 from torch import Tensor, nn
 
 from textocvp.layers import FeedForward, SelfAttention, sinusoids
@@ -43,6 +42,8 @@ TABLEAU_10 = {
 @cache
 def palette() -> dict[tuple[str, ...], RGB]:
     """Colour name, as a tuple of lower-case words, to RGB in 0..1; without names that are no words ("blue/green")."""
+    from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb  # takes longer to import than all of this package
+
     xkcd = {name.removeprefix("xkcd:"): value for name, value in XKCD_COLORS.items()}
     merged = {**xkcd, **CSS4_COLORS, **TABLEAU_10}  # later palettes win
     return {tuple(name.split()): to_rgb(value) for name, value in merged.items() if "/" not in name}
