@@ -17,7 +17,8 @@ from textocvp.parsers.base import Generators, Parsed, ParserConfig, SceneParser
 from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.parsers.efficientnet import LITE0, EfficientNetEncoder
-from textocvp.parsers.frozen import cells_along
+from textocvp.parsers.frozen import FrozenEncoder, cells_along
+from textocvp.parsers.frozen_votes import VotesEncoder
 from textocvp.slots import SlotLayout
 
 
@@ -30,10 +31,11 @@ class SaviConfig(ParserConfig):
     # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, or
     # of the frozen encoder's features.
     initializer: Literal["gaussian", "cluster"] = "cluster"
-    encoder: Literal["conv", "dinov2", "efficientnet-lite0"] = "conv"  # learned, or frozen
+    encoder: Literal["conv", "dinov2", "efficientnet-lite0", "votes"] = "conv"  # learned, or one of `FROZEN`
     encoder_channels: int = 32  # width of the convolutional encoder
     encoder_stride: int = 1  # of its first convolution
-    # Folder or hub id of DINOv2, file of EfficientNet-Lite0; empty for facebook/dinov2-base, and the extra's package.
+    # Folder or hub id of DINOv2, file of EfficientNet-Lite0, checkpoint whose parser is `votes`; empty for
+    # facebook/dinov2-base, the extra's package, and the bundled `cater`.
     encoder_weights: str = ""
     encoder_dim: int = 768  # width of its features
     encoder_patch: int = 14  # side of its patches in pixels
@@ -53,6 +55,9 @@ class SaviConfig(ParserConfig):
         if self.encoder == "conv":
             return None
         return cells_along(self.image_size, self.encoder_patch), self.encoder_dim
+
+
+FROZEN: dict[str, type[FrozenEncoder]] = {"dinov2": DinoEncoder, LITE0: EfficientNetEncoder, "votes": VotesEncoder}
 
 
 class ConvEncoder(nn.Module):
@@ -197,15 +202,16 @@ class SaviParser(SceneParser):
         super().__init__(config)
         dim = config.layout.dim
         if config.encoder != "conv":
-            lite = config.encoder == LITE0
-            self.frozen = (EfficientNetEncoder if lite else DinoEncoder)(
+            self.frozen = FROZEN[config.encoder](
                 config.encoder_weights,
                 dim=config.encoder_dim,
                 patch=config.encoder_patch,
                 fingerprint=config.encoder_fingerprint,
             )
             self.cells = self.frozen.cells(config.image_size)
-            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(config.encoder_dim, dim, lite)
+            self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(
+                config.encoder_dim, dim, place=config.encoder != "dinov2"
+            )
         else:
             self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)
         if config.initializer == "gaussian":
