@@ -14,28 +14,31 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from textocvp.layers import full_precision
+from textocvp.layers import full_precision, pixel_grid
 from textocvp.parsers.frozen import FrozenEncoder
-from textocvp.parsers.votes import REACH, VoteNetwork
+from textocvp.parsers.votes import OBJECT, VoteNetwork
 from textocvp.pretrained import CONFIG_FILE, WEIGHTS_FILE, WeightsError
 
 BUNDLED = Path(__file__).parent.parent / "checkpoints"
 DEFAULT = "cater"
 STRIDE = 2
+SIZE_SPREAD = 10.0  # of the sizes that are voted for
+WIDTH = 9
 
 
 class VotesEncoder(FrozenEncoder):
-    """What the network knows at half resolution, normalised, and the means of what it says of each 2x2 pixels.
+    """What the network says of each 2x2 pixels, and their colour: nine numbers, about -1..1.
 
-    The last six are the shares of background, objects and robot, in -1..1, and the votes, in units of `REACH`. All are
-    as precise as float16: read from a cache they are the same.
+    Shares of background, object and robot; where the centre of the thing is, (x, y), and its size, 0 where there is no
+    thing; red, green, blue. So all pixels of a thing say the same, and those of its twin another place. All are as
+    precise as float16: read from a cache they are the same.
 
     Args:
         weights: a checkpoint's folder, or the name of a bundled one; empty for `cater`.
         others: as `FrozenEncoder`.
     """
 
-    def __init__(self, weights: str | Path = "", *, dim: int = 30, patch: int = STRIDE, **others: Any) -> None:
+    def __init__(self, weights: str | Path = "", *, dim: int = WIDTH, patch: int = STRIDE, **others: Any) -> None:
         super().__init__(weights, dim=dim, patch=patch, **others)
 
     def _read(self) -> tuple[nn.Module, str]:
@@ -54,7 +57,7 @@ class VotesEncoder(FrozenEncoder):
                 f"{self.part}.encoder_weights: the parser of {name!r} is no 'votes', but {parser['kind']!r}"
             )
         channels, full = parser["channels"], parser["channels_full"]
-        self._check_sizes(channels + 6, STRIDE, str(folder))
+        self._check_sizes(WIDTH, STRIDE, str(folder))
         network = VoteNetwork([channels * times for times in (1, 2, 3, 4)], full)
         own = {key: tensors[f"parser.network.{key}"].float().contiguous() for key in network.state_dict()}
         # Of this network alone: another predictor beside it is the same encoder.
@@ -70,9 +73,12 @@ class VotesEncoder(FrozenEncoder):
     def _encode(self, backbone: nn.Module, frames_N3HW: Tensor) -> Tensor:
         assert isinstance(backbone, VoteNetwork)
         with full_precision(frames_N3HW.device):
-            inner_NChw, fine_NCHW = backbone.look(frames_N3HW.float())
-            logits_N3HW, votes_N3HW = backbone.say(inner_NChw, fine_NCHW)
-            said_N6HW = torch.cat([2 * logits_N3HW.softmax(1) - 1, votes_N3HW / REACH], 1)
-            said_NL6, inner_NLC = (x.flatten(2).transpose(1, 2) for x in (F.avg_pool2d(said_N6HW, STRIDE), inner_NChw))
-            inner_NLC = F.layer_norm(inner_NLC, inner_NLC.shape[-1:])
-        return torch.cat([inner_NLC, said_NL6], 2).half().float()
+            logits_N3HW, votes_N3HW = backbone(frames_N3HW.float())
+            shares_N3HW = logits_N3HW.softmax(1)
+            H, W = frames_N3HW.shape[-2:]
+            # From each pixel to the centre, in pixels: as a place of the frame, and the size beside it.
+            offset_N2HW = votes_N3HW[:, :2] * votes_N3HW.new_tensor([2 / W, 2 / H])[:, None, None]
+            center_N2HW = pixel_grid(H, W, device=votes_N3HW.device).permute(2, 0, 1) + offset_N2HW
+            thing_N3HW = torch.cat([center_N2HW, votes_N3HW[:, 2:] / SIZE_SPREAD], 1) * shares_N3HW[:, OBJECT, None]
+            features_N9HW = torch.cat([2 * shares_N3HW - 1, thing_N3HW, frames_N3HW], 1)
+            return F.avg_pool2d(features_N9HW, STRIDE).flatten(2).transpose(1, 2).half().float()

@@ -85,7 +85,7 @@ class FeatureProjection(nn.Module):
 
     def __init__(self, feature_dim: int, out_dim: int, place: bool) -> None:
         super().__init__()
-        # A transformer's features know it already, those of convolutions do not.
+        # A transformer's features and votes know it already, those of convolutions do not.
         self.position = PositionCode(feature_dim) if place else nn.Identity()
         hidden = max(feature_dim, out_dim)
         self.mlp = nn.Sequential(
@@ -157,6 +157,10 @@ class SlotAttention(nn.Module):
         self.query = nn.Linear(slot_dim, slot_dim, bias=False)
         self.key = nn.Linear(slot_dim, slot_dim, bias=False)
         self.value = nn.Linear(slot_dim, slot_dim, bias=False)
+        for layer in (self.query, self.key, self.value):
+            nn.init.xavier_uniform_(
+                layer.weight
+            )  # as published; PyTorch's own is a third of it: slots stay alike longer
         self.gru = nn.GRUCell(slot_dim, slot_dim)
         self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
 
@@ -210,7 +214,7 @@ class SaviParser(SceneParser):
             )
             self.cells = self.frozen.cells(config.image_size)
             self.encoder: ConvEncoder | FeatureProjection = FeatureProjection(
-                config.encoder_dim, dim, place=config.encoder != "dinov2"
+                config.encoder_dim, dim, place=config.encoder == LITE0
             )
         else:
             self.encoder = ConvEncoder(config.encoder_channels, config.encoder_stride, dim)

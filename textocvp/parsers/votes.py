@@ -100,10 +100,6 @@ class VoteNetwork(nn.Module):
             init_relu_(layer)
 
     def forward(self, frames_N3HW: Tensor) -> tuple[Tensor, Tensor]:
-        return self.say(*self.look(frames_N3HW))
-
-    def look(self, frames_N3HW: Tensor) -> tuple[Tensor, Tensor]:
-        """What it knows at half resolution (N, `channels[0]`, H / 2, W / 2), and at full (N, `full`, H, W)."""
         # Exposure and white balance are taken out, so that only uneven light is left to learn.
         mean, std = frames_N3HW.mean((2, 3), keepdim=True), frames_N3HW.std((2, 3), keepdim=True)
         x = ((frames_N3HW - mean) / (std + 0.05)).contiguous(memory_format=torch.channels_last)
@@ -116,10 +112,6 @@ class VoteNetwork(nn.Module):
         for block, level in zip(self.up, levels[-2::-1], strict=True):
             x = F.interpolate(x, scale_factor=2.0)[:, :, : level.shape[2], : level.shape[3]]
             x = block(torch.cat([x, level], 1))
-        return x, fine
-
-    def say(self, x: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
-        """Class logits and votes, of what `look` gives."""
         x = F.relu(F.pixel_shuffle(self.widen(x), 2))
         x = self.out(F.relu(self.border(torch.cat([x, fine], 1)))).float()
         return x[:, :3], REACH * x[:, 3:]
