@@ -15,7 +15,7 @@ from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
 from textocvp.parsers.frozen_votes import VotesEncoder
 from textocvp.parsers.savi import SaviConfig
-from textocvp.parsers.votes import OBJECT, REACH, VotesConfig
+from textocvp.parsers.votes import OBJECT, VotesConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.presets import preset
 from textocvp.pretrained import WeightsError
@@ -47,27 +47,32 @@ def student(voter: Path | str, **changes: object) -> ModelConfig:
         initializer="gaussian",
         encoder="votes",
         encoder_weights=str(voter),
-        encoder_dim=10,
+        encoder_dim=9,
         encoder_patch=2,
         transition_hidden=16,
     )
-    renderer = FeatureConfig(patches=16, layers=3, hidden=16, feature_dim=10, image_channels=32)
+    renderer = FeatureConfig(patches=16, layers=3, hidden=16, feature_dim=9, image_channels=32)
     return ModelConfig("student", replace(parser, **changes), renderer, SMALL_TEXT, WINDOW)  # type: ignore[arg-type]
 
 
-def test_features_are_what_the_network_knows_and_says(voter: Path) -> None:
+def test_features_are_what_the_network_says(voter: Path) -> None:
     network = TextOCVP.from_pretrained(voter).parser.network
-    found = VotesEncoder(voter, dim=10)(frames())
-    assert found.shape == (3, 16 * 16, 10)
+    found = VotesEncoder(voter)(frames())
+    assert found.shape == (3, 16 * 16, 9)
     assert torch.equal(found, found.half().float())  # a cache loses nothing
     with torch.no_grad():
         logits, votes = network(frames())
-    shares, votes = logits.softmax(1)[:, OBJECT], votes / REACH
+    shares = logits.softmax(1)
     # Place (row 2, column 5) is pixels (4..5, 10..11).
-    at = found[:, 2 * 16 + 5]
-    torch.testing.assert_close(at[:, 5], 2 * shares[:, 4:6, 10:12].mean((1, 2)) - 1, atol=2e-3, rtol=2e-3)
-    torch.testing.assert_close(at[:, 7:], votes[:, :, 4:6, 10:12].mean((2, 3)), atol=2e-3, rtol=2e-3)
-    assert at[:, :4].mean(1).abs().max() < 1e-2  # normalised
+    for number, said in {
+        **{kind: 2 * shares[:, kind] - 1 for kind in range(3)},
+        # Where the centre is: columns are x, 32 pixels are 2 wide.
+        3: shares[:, OBJECT] * ((torch.arange(32) + 0.5 + votes[:, 0]) / 16 - 1),
+        4: shares[:, OBJECT] * ((torch.arange(32)[:, None] + 0.5 + votes[:, 1]) / 16 - 1),
+        **{6 + channel: frames()[:, channel] for channel in range(3)},
+    }.items():
+        wanted = said[:, 4:6, 10:12].mean((1, 2))
+        torch.testing.assert_close(found[:, 2 * 16 + 5, number], wanted, atol=2e-3, rtol=2e-3)
 
 
 def test_it_learns_nothing_and_is_in_no_checkpoint(voter: Path, tmp_path: Path) -> None:
@@ -103,14 +108,18 @@ def test_another_predictor_beside_it_is_the_same_encoder_but_no_other_network(vo
         TextOCVP.from_pretrained(tmp_path / "student").parser(frames()[:, None])
 
 
-def test_the_bundled_network_tells_things_apart() -> None:
-    """No name is needed for it, and things are objects: of one on an empty floor, and nowhere else."""
+def test_the_bundled_network_tells_twins_apart() -> None:
+    """No name is needed for it. All pixels of a thing say where its middle is, and its twin's say where that is."""
     picture = torch.full((1, 3, 64, 64), 0.3)
-    picture[:, :, 30:38, 20:28] = torch.tensor([0.6, -0.8, -0.8])[:, None, None]
+    for left in (16, 40):
+        picture[:, :, 30:38, left : left + 8] = torch.tensor([0.6, -0.8, -0.8])[:, None, None]
     grid = VotesEncoder()(picture)[0].unflatten(0, (32, 32))
-    share = (grid[..., 24 + OBJECT] + 1) / 2
-    assert share[16:18, 11:13].min() > 0.8
-    assert share[:10].max() < 0.2
+    for left in (16, 40):
+        inside = grid[16:18, left // 2 + 1 : left // 2 + 3]
+        assert inside[..., OBJECT].min() > 0.6
+        middle = torch.tensor([(left + 4) / 32 - 1, 34 / 32 - 1])
+        assert (inside[..., 3:5] - middle).abs().max() < 0.06  # two pixels
+    assert grid[:10, :, OBJECT].max() < -0.6
 
 
 @pytest.mark.parametrize(
@@ -124,14 +133,14 @@ def test_the_bundled_network_tells_things_apart() -> None:
 def test_what_is_no_voting_network_is_refused(voter: Path, change: object, message: str) -> None:
     change(voter)  # type: ignore[operator]
     with pytest.raises(WeightsError, match=message):
-        VotesEncoder(voter, dim=10).load()
+        VotesEncoder(voter).load()
 
 
 def test_sizes_must_be_those_of_the_network(voter: Path) -> None:
-    with pytest.raises(WeightsError, match=r"parser\.encoder_dim is 30, that of the weights in .* is 10"):
-        VotesEncoder(voter).load()
+    with pytest.raises(WeightsError, match=r"parser\.encoder_dim is 30, that of the weights in .* is 9"):
+        VotesEncoder(voter, dim=30).load()
     with pytest.raises(WeightsError, match=r"parser\.encoder_patch is 4, .* is 2"):
-        VotesEncoder(voter, dim=10, patch=4).load()
+        VotesEncoder(voter, patch=4).load()
 
 
 def set_kind(folder: Path, kind: str) -> None:
