@@ -4,6 +4,7 @@ It stands where the paper has DINOv2: slot attention learns on features that tel
 """
 
 import json
+import math
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from textocvp.layers import full_precision, pixel_grid
+from textocvp.parsers.clustering import ClusterInitializer, Clusters
 from textocvp.parsers.frozen import FrozenEncoder
-from textocvp.parsers.votes import OBJECT, VoteNetwork
+from textocvp.parsers.votes import OBJECT, SIZE_UNIT, VoteNetwork, count_votes
 from textocvp.pretrained import CONFIG_FILE, WEIGHTS_FILE, WeightsError
 
 BUNDLED = Path(__file__).parent.parent / "checkpoints"
@@ -24,6 +26,7 @@ DEFAULT = "cater"
 STRIDE = 2
 SIZE_SPREAD = 10.0  # of the sizes that are voted for
 WIDTH = 9
+PEAK_RADIUS = 1.5  # places within which there is no second thing
 
 
 class VotesEncoder(FrozenEncoder):
@@ -82,3 +85,25 @@ class VotesEncoder(FrozenEncoder):
             thing_N3HW = torch.cat([center_N2HW, votes_N3HW[:, 2:] / SIZE_SPREAD], 1) * shares_N3HW[:, OBJECT, None]
             features_N9HW = torch.cat([2 * shares_N3HW - 1, thing_N3HW, frames_N3HW], 1)
             return F.avg_pool2d(features_N9HW, STRIDE).flatten(2).transpose(1, 2).half().float()
+
+
+class VotedClusters(ClusterInitializer):
+    """Clusters of the places that vote for the same centre, of the features of `VotesEncoder`."""
+
+    @torch.no_grad()
+    def forward(self, features: Tensor, num_slots: int) -> Clusters:
+        """Divide the places of features (B, `WIDTH`, h, w): the background, then the things, the clearest first."""
+        _, _, h, w = features.shape
+        side = features.new_tensor([w / 2, h / 2])[:, None, None]
+        masks_BKhw = features.new_zeros(len(features), num_slots, h, w)
+        for features_9hw, masks_Khw in zip(features.float(), masks_BKhw, strict=True):
+            shares_3hw = (features_9hw[:3] + 1) / 2
+            thing_3hw = features_9hw[3:6] / shares_3hw[OBJECT].clamp_min(0.1)
+            offset_2hw = (thing_3hw[:2] - pixel_grid(h, w, device=features.device).permute(2, 0, 1)) * side
+            size_1hw = SIZE_SPREAD * thing_3hw[2:] - SIZE_UNIT * math.log(STRIDE)  # of a radius in places
+            votes_3hw = torch.cat([offset_2hw, size_1hw])
+            ballot = count_votes(shares_3hw, votes_3hw, num_slots - 1, min_votes=1.0, peak_radius=PEAK_RADIUS)
+            if len(ballot.peaks_P3):
+                masks_Khw[1 + ballot.elect(ballot.peaks_P3), ballot.y_L, ballot.x_L] = 1
+            masks_Khw[0] = 1 - masks_Khw[1:].sum(0)
+        return Clusters(masks_BKhw, (masks_BKhw.sum((2, 3)) > 0).to(features.dtype))

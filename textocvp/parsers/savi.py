@@ -18,7 +18,7 @@ from textocvp.parsers.clustering import ClusterInitializer, FeatureClusters
 from textocvp.parsers.dino import DinoEncoder
 from textocvp.parsers.efficientnet import LITE0, EfficientNetEncoder
 from textocvp.parsers.frozen import FrozenEncoder, cells_along
-from textocvp.parsers.frozen_votes import VotesEncoder
+from textocvp.parsers.frozen_votes import VotedClusters, VotesEncoder
 from textocvp.slots import SlotLayout
 
 
@@ -28,8 +28,8 @@ class SaviConfig(ParserConfig):
 
     kind: Literal["savi"] = "savi"
     layout: SlotLayout = SlotLayout(content=64, explicit=False)
-    # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, or
-    # of the frozen encoder's features.
+    # `gaussian` samples from one learned Gaussian (published); `cluster` starts from clusters of colour and place, of
+    # the frozen encoder's features, or of its votes.
     initializer: Literal["gaussian", "cluster"] = "cluster"
     encoder: Literal["conv", "dinov2", "efficientnet-lite0", "votes"] = "conv"  # learned, or one of `FROZEN`
     encoder_channels: int = 32  # width of the convolutional encoder
@@ -221,7 +221,8 @@ class SaviParser(SceneParser):
         if config.initializer == "gaussian":
             self.initializer: GaussianInitializer | ClusterSlots = GaussianInitializer(dim)
         else:
-            self.initializer = ClusterSlots(dim, FeatureClusters() if self.frozen else ClusterInitializer())
+            clusters = {"conv": ClusterInitializer, "votes": VotedClusters}.get(config.encoder, FeatureClusters)
+            self.initializer = ClusterSlots(dim, clusters())
         self.corrector = SlotAttention(dim, hidden=2 * dim)
         # Between frames: one transformer encoder block over the slots (4 heads, MLP of 512 in the paper).
         sizes = (dim, config.transition_heads, config.transition_hidden)
