@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from tests.textocvp.conftest import SMALL_TEXT
 from textocvp.config import ModelConfig
 from textocvp.model import TextOCVP
-from textocvp.parsers.frozen_votes import VotesEncoder
+from textocvp.parsers.frozen_votes import VotedClusters, VotesEncoder
 from textocvp.parsers.savi import SaviConfig
 from textocvp.parsers.votes import OBJECT, VotesConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
@@ -120,6 +120,20 @@ def test_the_bundled_network_tells_twins_apart() -> None:
         middle = torch.tensor([(left + 4) / 32 - 1, 34 / 32 - 1])
         assert (inside[..., 3:5] - middle).abs().max() < 0.06  # two pixels
     assert grid[:10, :, OBJECT].max() < -0.6
+
+
+def test_slots_may_begin_with_what_is_elected() -> None:
+    """Twins get a slot each, of their own places; what has no votes is background, also where there are no things."""
+    picture = torch.full((2, 3, 64, 64), 0.3)
+    for left in (16, 40):
+        picture[0, :, 30:38, left : left + 8] = torch.tensor([0.6, -0.8, -0.8])[:, None, None]
+    found = VotedClusters()(VotesEncoder()(picture).transpose(1, 2).unflatten(2, (32, 32)), 5)
+    assert torch.equal(found.masks.sum(1), torch.ones(2, 32, 32))
+    assert found.presence.tolist() == [[1, 1, 1, 0, 0], [1, 0, 0, 0, 0]]
+    owner = found.masks[0].argmax(0)
+    owners = [owner[15:19, left // 2 : left // 2 + 4].unique().tolist() for left in (16, 40)]
+    assert sorted(owners) == [[1], [2]]
+    assert (owner > 0).sum() < 60  # of two times 16, and what they throw shadows on
 
 
 @pytest.mark.parametrize(
