@@ -123,7 +123,7 @@ def read_options(options: Mapping[str, Any] | None, task: Task, defaults: SceneR
     if not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping, not {type(options).__name__}")
     allowed = (*OPTIONS, *task.scene_options)
-    if unknown := ", ".join(map(repr, sorted(set(options) - set(allowed)))):
+    if unknown := ", ".join(map(repr, sorted(set(options) - set(allowed), key=str))):
         raise ValueError(f"unknown reset option {unknown}; allowed: {', '.join(allowed)}")
     factors = read_factors(options["factors"]) if options.get("factors") is not None else None
     sizes = setup.with_factors(factors or {}).sizes

@@ -187,6 +187,8 @@ def make_setup(
     if sizes is not None:
         check_choice("sizes", sizes, SIZES)
         setup = replace(setup, sizes=SIZES[sizes])
+    if not isinstance(factors, Factors | None):
+        raise ValueError(f"factors are Factors or a mapping of values, not {factors!r}")
     if factors is not None and not setup.crowded and any(getattr(factors, name) for name in SHARES):
         raise ValueError(f"the scene {scene!r} has no {', '.join(SHARES)}: set these factors to 0")
     check_range("object_scale", object_scale, 0.5, 1.0)

@@ -1,7 +1,7 @@
 """Action and observation spaces of the environments."""
 
 import string
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import pi
 from typing import Any
 
@@ -59,6 +59,8 @@ def read_observations(
 ) -> tuple[str, ...]:
     """The names of all observations; ValueError for one that there is not."""
     extras = (extras,) if isinstance(extras, str) else extras
+    if not isinstance(extras, Iterable) or not isinstance(observations, str | Iterable | None):
+        raise ValueError("extras and observations are names, or lists of names")
     for extra in extras:
         check_choice("extras", extra, EXTRAS)
     if observations is not None:

@@ -168,9 +168,9 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         observations: str | Sequence[str] | None = None,
         **wishes: Any,
     ) -> None:
-        if isinstance(task, str):
+        if not isinstance(task, Task):
             check_choice("task", task, TASKS)
-        self.task = TASKS[task] if isinstance(task, str) else task
+        self.task = task if isinstance(task, Task) else TASKS[task]
         self.n_pairs = self.task.pairs[0] if n_pairs is None else n_pairs
         check_range("n_pairs", self.n_pairs, *self.task.pairs, whole=True)
         check_choice("control", control, ("primitive", "ee"))
@@ -182,6 +182,8 @@ class TabletopEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.setup = setup = make_setup(scene, camera, sizes, factors, object_scale)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         check_choice("reward", reward, REWARDS)
+        for name, value in (("place_yaw", place_yaw), ("record_frames", record_frames)):
+            check_choice(name, value, (False, True))
         always = ("rgb", "instruction", *("goal_rgb",) * self.task.stacks)
         self.observations = read_observations(observations, extras, always)
         check_range("image_size", image_size, 16, 2048, whole=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union
 import imageio.v3 as iio
 import torch
 import tyro
-from PIL import UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -387,7 +387,7 @@ def _rollout(command: RolloutCommand) -> None:
         picture, done = read_picture(command.image, world_model.image_size, resize=command.resize, crop=command.crop)
     except FileNotFoundError:
         raise Mistake(f"there is no picture {command.image}") from None
-    except (UnidentifiedImageError, OSError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError) as error:
         raise Mistake(f"{command.image} is no picture that can be read: {error}") from error
     except ValueError as error:
         raise Mistake(f"{command.image} cannot be taken: {error}") from error

@@ -6,7 +6,7 @@ Pictures can be sound and still be of another world than the model's. `OwnFrames
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -221,6 +221,8 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
         TypeError: if one is no string.
         ValueError: if there is none, or an empty one, or one that denies something to a model that knows only wishes.
     """
+    if isinstance(text, bytes | Mapping) or not isinstance(text, str | Iterable):
+        raise TypeError(f"give one text, or a list of texts, and not {type(text).__name__}")
     texts = [text] if isinstance(text, str) else list(text)
     if not texts:
         raise ValueError("no text: give one sentence or several")

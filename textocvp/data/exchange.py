@@ -4,6 +4,7 @@ LeRobot's layout is written and read with pyarrow, so that frames stay what they
 its dependencies is needed. Minari's own library writes and reads its sets, without its JPEG encoding.
 """
 
+import errno
 import io
 import json
 import re
@@ -388,6 +389,14 @@ def _to_minari(episodes: EpisodeFile, out: Path, name: str) -> list[str]:
     if first.state is not None:
         spaces["proprio"] = gym.spaces.Box(-np.inf, np.inf, first.state.shape[1:], np.float32)
     action_space = gym.spaces.Box(-np.inf, np.inf, first.action.shape[1:], np.float32)
+    needed = episodes.lengths.sum() * side**2 * 3 * 1.1
+    if needed > (free := shutil.disk_usage(out).free):  # HDF5 would end the process
+        raise OSError(
+            errno.ENOSPC,
+            f"Minari's files, which are not compressed, need about {needed / 1e6:.0f} MB, of "
+            f"which {free / 1e6:.0f} are free",
+            str(out.parent / name),
+        )
     written = storage.MinariStorage.new(
         out / "data", gym.spaces.Dict(spaces), action_space, data_format="hdf5", jpeg_encoding=False
     )

@@ -1,6 +1,7 @@
 """Pictures of rollouts: frames and masks, enlarged, with one stable colour for each slot."""
 
 import colorsys
+import io
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,7 +75,10 @@ def save_film(
             return path
         film = [_screen(stacked[:, t], captions) for t in range(T)]
         if suffix == ".gif":
-            imageio.mimsave(new, film, format="GIF", duration=1000 / fps, loop=0)  # type: ignore[arg-type]
+            # Into memory: on a full disk the library would try again, and fail, while it is cleaned up.
+            packed = io.BytesIO()
+            imageio.mimsave(packed, film, format="GIF", duration=1000 / fps, loop=0)  # type: ignore[arg-type]
+            new.write_bytes(packed.getvalue())
         else:
             # The video codec halves the colour planes, so both sides must be even.
             even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in film]

@@ -16,8 +16,12 @@ from typing import NamedTuple
 # Whoever has never read one of these imagines the opposite of what is said.
 NEGATIONS = frozenset((
     "not", "no", "never", "nor", "neither", "none", "nothing", "without", "except", "avoid", "cannot", "cant", "dont",
-    "doesnt", "mustnt", "shouldnt", "wont",
+    "doesnt", "mustnt", "shouldnt", "wont", "stop", "refrain", "refuse", "forbid", "forbidden", "prevent", "outside",
 ))  # fmt: skip
+DENYING = (  # the second word somewhere after the first
+    ("anywhere", "but"), ("anything", "but"), ("everywhere", "but"), ("all", "but"), ("keep", "out"), ("keep", "away"),
+    ("keep", "off"), ("stay", "out"), ("stay", "away"), ("leave", "out"),
+)  # fmt: skip
 
 # Whoever says one of these before a thing means another place than the words "in" and "on" of a form do.
 ELSEWHERE = frozenset((
@@ -37,9 +41,14 @@ def split(text: str) -> list[str]:
     return _WORD.findall(text.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'"))
 
 
-def is_negation(word: str) -> bool:
-    """Whether a word of `split` denies what is said."""
-    return word.replace("'", "") in NEGATIONS or word.endswith("n't")
+def denials(text: str) -> list[str]:
+    """The words of a text that deny what is said."""
+    words = split(text)
+    found = [one for one in words if one.replace("'", "") in NEGATIONS or one.endswith("n't")]
+    for first, second in DENYING:
+        if first in words and second in words[words.index(first) :]:
+            found.append(f"{first} ... {second}")
+    return found
 
 
 def reword(text: str, rules: tuple[str, ...]) -> list[str]:

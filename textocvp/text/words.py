@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from textocvp.layers import FeedForward, SelfAttention, sinusoids
 from textocvp.text.base import RGB, TextConfig, TextEncoder, TextTokens, WordBatch
-from textocvp.text.wording import ELSEWHERE, HOLE, compile_rules, is_negation, match_form, reword, split
+from textocvp.text.wording import ELSEWHERE, HOLE, compile_rules, denials, match_form, reword, split
 
 # Row 0 is padding, so that a padded batch needs no other bookkeeping. Row 1 is not used: unknown words are left out.
 SPECIAL = ("<pad>", "<unk>", "<color>")
@@ -210,7 +210,7 @@ class WordEncoder(TextEncoder):
         return [one for one in dict.fromkeys(self.config.tokens(text)) if not self.config.knows(one)]
 
     def negations(self, text: str) -> list[str]:
-        return [one for one in split(text) if is_negation(one) and not self.config.knows(one)]
+        return [one for one in denials(text) if not self.config.knows(one)]
 
     def forms_but(self, text: str) -> tuple[str, ...]:
         return () if self._read(text)[1] else self.config.forms

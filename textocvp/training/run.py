@@ -11,6 +11,7 @@ import atexit
 import errno
 import fcntl
 import json
+import math
 import os
 import shutil
 import signal
@@ -41,21 +42,25 @@ SETTINGS_FILE = "settings.json"
 LOCK_FILE = ".lock"
 RUN_FILES = ("state", "samples", "checkpoint", SETTINGS_FILE)  # of a run, without its logs and caches
 LOG_EVERY = 20  # updates
-# The least that settings of any stage may be; checked before anything is written.
-LEAST = {
-    "episodes": 1,
-    "steps": 0,
-    "batch": 1,
-    "warmup": 0,
-    "learning_rate": 0.0,
-    "clip_norm": 0.0,
-    "seed": 0,
-    "evaluate_every": 1,
-    "evaluate_episodes": 1,
-    "save_minutes": 0.0,
-    "stride": 1,
-    "clip": 1,
-    "workers": 0,
+# The least and the most that settings of any stage may be; checked before anything is written.
+TINY, SEEDS, LARGEST_BATCH = 1e-12, 2**63 - 1, 65536
+LIMITS: dict[str, tuple[float, float]] = {
+    "episodes": (1, math.inf),
+    "steps": (0, math.inf),
+    "batch": (1, LARGEST_BATCH),
+    "warmup": (0, math.inf),
+    "learning_rate": (TINY, 1.0),
+    "clip_norm": (TINY, math.inf),
+    "seed": (0, SEEDS),
+    "evaluate_every": (1, math.inf),
+    "evaluate_episodes": (1, math.inf),
+    "save_minutes": (0.0, math.inf),
+    "stride": (1, math.inf),
+    "clip": (1, math.inf),
+    "workers": (0, math.inf),
+    "thing_weight": (0.0, 1e6),
+    "changed_weight": (0.0, 1e6),
+    "first_redraw": (0, math.inf),
 }
 BEGINS_WITH = ("parser", "taught", "start", "vqvae")  # settings that name a checkpoint, in one stage or another
 SYNC_TIMEOUT = timedelta(hours=12)  # how long processes wait for one that parses or evaluates
@@ -126,11 +131,11 @@ class TrainingSettings(RunPaths):
     """Throw away the run that `out` holds, finished or not, and begin anew. Its caches and logs stay."""
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
+        for name, (least, most) in LIMITS.items():
             value = getattr(self, name, None)
-            if value is not None and not value >= least:
-                option = name.replace("_", "-")
-                raise SettingsError(f"--{option} is {value}: must be at least {least}")
+            if value is not None and not least <= value <= most:
+                span = f"at least {least}" if most == math.inf else f"{least} to {most}"
+                raise SettingsError(f"--{name.replace('_', '-')} is {value}: must be {span}")
         for name in BEGINS_WITH:
             source = getattr(self, name, None)
             if source and (path := Path(source)).exists() and self.out.resolve() in path.resolve().parents:
@@ -313,9 +318,20 @@ class Run:
                 path = args.out / name
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         accelerator.wait_for_everyone()
-        self.first = load_state(accelerator, args.out)
-        if accelerator.is_main_process:
-            _compare_settings(args, resumed=self.first > 0)
+        try:
+            self.first = load_state(accelerator, args.out)
+            if accelerator.is_main_process:
+                _compare_settings(args, resumed=self.first > 0)
+        except SettingsError:
+            raise
+        except Exception as error:  # several libraries read, each fails in its own way
+            said = str(error).partition("\n")[0]
+            raise SettingsError(
+                f"{args.out} holds a run that cannot be gone on with: its state or {SETTINGS_FILE} is damaged, or of "
+                f"another model ({said}); --fresh throws it away"
+            ) from error
+        if accelerator.is_main_process and self.first >= args.steps > 0:
+            tqdm.write(f"the run in {args.out} is finished ({self.first} updates): nothing more is trained")
 
     @property
     def device(self) -> torch.device:
@@ -336,11 +352,19 @@ class Run:
                 due = time.monotonic() - saved > 60 * self.args.save_minutes
                 due, stop = self._any_process(due, bool(asked))
                 if due or stop:
-                    save_state(self.accelerator, self.args.out, step + 1)
+                    self._save(step + 1)
                     saved = time.monotonic()
                 if stop:
                     raise SystemExit(128 + signal.SIGTERM)
-        save_state(self.accelerator, self.args.out, self.args.steps)
+        self._save(total)
+
+    def _save(self, next_step: int) -> None:
+        if not all(bool(parameter.isfinite().all()) for parameter in self.module.parameters()):
+            raise DivergedError(
+                f"training diverged before step {next_step}: a weight is not finite. Nothing was saved since the last "
+                "good state; lower --learning-rate, with another --out"
+            )
+        save_state(self.accelerator, self.args.out, next_step)
 
     def micro_batches(self, *, of_batch: bool = False) -> Iterator[slice]:
         """Parts of this process's rows; each wants one `backward`.
