@@ -34,6 +34,8 @@ ABSENT = 0.08
 LIGHT = (0.7, 1.05)  # surfaces show their colour times the light on them
 # Frames of a video differ from the next in at most 10 % of the pixels, two scenes in at least 32 % (66 pairs).
 SAME_SCENE = 0.2
+OTHER_CANVAS = 60  # of 0..255, by which the median pixel may differ where all held-out frames have the same
+LEARNT_DB = 18.0  # of a parser's own world, on average; below it a picture that is redrawn badly tells nothing
 DARK = 40  # of 0..255; a colour below it has no hue
 
 
@@ -164,8 +166,12 @@ def warn_of_foreign(
         hue_3 = values_B3HW.new_tensor(list(bytes.fromhex(own.hue))) / 255
         now_B, other_B = hue_shares(values_B3HW, torch.stack([hue_3, hue_3.flip(0)])).unbind(1)
         swapped_B = (other_B >= HUE_SHARE) & (other_B >= 2 * now_B)
+    other_B = torch.zeros_like(gray_B)
+    if own.canvas:
+        own_3 = values_B3HW.new_tensor(list(bytes.fromhex(own.canvas)))
+        other_B = (values_B3HW.flatten(2).median(-1).values - own_3).abs().amax(1) > OTHER_CANVAS
     poor_B = psnr_B < own.psnr_low
-    for i in (flat_B | gray_B | swapped_B | poor_B).nonzero()[:, 0].tolist():
+    for i in (flat_B | gray_B | swapped_B | other_B | poor_B).nonzero()[:, 0].tolist():
         if flat_B[i]:
             black = values_B3HW[i].max() <= FLAT
             cause = "is all of one colour" + (": black, as a 0..1 picture cast to uint8 is" if black else "")
@@ -173,9 +179,11 @@ def warn_of_foreign(
             cause = "is gray, its three channels are equal"
         elif swapped_B[i]:
             cause = "has red and blue swapped (BGR): image[..., ::-1] swaps them back"
-        elif _upside_down(frames_B3HW[i : i + 1], psnr_B[i], own, psnr_of):
+        elif own.psnr < LEARNT_DB:
+            cause = f"is redrawn badly because all are: this parser has learnt too little ({own.psnr:.0f} dB)"
+        elif not other_B[i] and _upside_down(frames_B3HW[i : i + 1], psnr_B[i], own, psnr_of):
             cause = "is upside down: image[::-1] turns it"
-        elif psnr_B[i] < own.psnr_low - FOREIGN_DB:
+        elif other_B[i] or psnr_B[i] < own.psnr_low - FOREIGN_DB:
             cause = "shows another camera, scene or light"
         else:
             continue

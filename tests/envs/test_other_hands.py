@@ -119,6 +119,12 @@ def test_a_list_of_scenes_is_walked_through(make: Make, tmp_path: Path) -> None:
         ({"scenes": [1, "x"]}, ValueError, "scene 1 of scenes: seed must be a whole number of at least 0"),
         ({"scenes": [{"n_objects": 99}]}, ValueError, "scene 0 of scenes: n_objects must be"),
         ({"render_size": 8}, ValueError, "render_size must be a whole number of 16 to 2048"),
+        ({"extras": None}, ValueError, "extras and observations are names, or lists of names"),
+        ({"observations": 3}, ValueError, "extras and observations are names, or lists of names"),
+        ({"task": None}, ValueError, "unknown task None; allowed: .*put_block_in_bowl"),
+        ({"factors": "all"}, ValueError, "factors are Factors or a mapping of values, not 'all'"),
+        ({"place_yaw": "yes"}, ValueError, "unknown place_yaw 'yes'; allowed: False, True"),
+        ({"record_frames": "no"}, ValueError, "unknown record_frames 'no'; allowed: False, True"),
     ],
 )
 def test_wrong_wishes_are_refused_at_once(arguments: dict[str, Any], kind: Any, message: str) -> None:
@@ -179,6 +185,13 @@ def test_a_copy_before_the_first_reset_and_of_a_wrapped_environment() -> None:
     with pytest.raises(TypeError, match="copy the environment"):
         copy.deepcopy(env.unwrapped.world)
     twin.close()
+    env.close()
+
+
+def test_reset_options_are_named_by_strings() -> None:
+    env = tiny()
+    with pytest.raises(ValueError, match="unknown reset option 3, 'x'; allowed: layout"):
+        env.reset(seed=0, options={3: 4, "x": 1})
     env.close()
 
 

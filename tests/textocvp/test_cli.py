@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import gc
 import json
 import runpy
 import sys
@@ -110,6 +112,30 @@ def test_mistakes_are_one_line(capsys, tmp_path, checkpoint, picture, changes, p
     arguments = ["rollout", given["picture"], given["text"], "--horizon", given["horizon"]]
     assert part in says(capsys, [*arguments, "--out", given["out"], "--checkpoint", given["checkpoint"]], 1)
     assert not (tmp_path / "a.gif").exists()
+
+
+def test_a_huge_picture_is_one_line(capsys, tmp_path, checkpoint, monkeypatch) -> None:
+    monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", 100)  # of twice as many PIL thinks that they are an attack
+    iio.imwrite(tmp_path / "huge.png", np.zeros((32, 32, 3), np.uint8))
+    arguments = ["rollout", str(tmp_path / "huge.png"), TEXT, "--out", str(tmp_path / "a.gif")]
+    assert "no picture that can be read: Image size" in says(capsys, [*arguments, "--checkpoint", checkpoint], 1)
+
+
+def test_a_film_that_finds_no_room_is_one_line(capfd, tmp_path, checkpoint, picture, monkeypatch) -> None:
+    """The library that packs it must not try again, and fail again, when it is cleaned up."""
+    write = Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        write(path, data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    out = tmp_path / "a.gif"
+    assert cli.main(["rollout", picture, TEXT, "--horizon", "2", "--out", str(out), "--checkpoint", checkpoint]) == 1
+    gc.collect()
+    err = capfd.readouterr().err
+    assert f"No space left on device: '{out}'" in err and "Traceback" not in err
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["checkpoint", "scene.png"]
 
 
 def test_info_describes_a_checkpoint(capsys, checkpoint) -> None:

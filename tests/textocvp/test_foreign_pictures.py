@@ -77,6 +77,7 @@ def gray(picture: np.ndarray) -> np.ndarray:
         (lambda picture: picture[::-1], "is upside down: image[::-1]", 0.5),  # the others are redrawn well enough
         (np.zeros_like, "is all of one colour: black, as a 0..1 picture cast to uint8", 1.0),
         (lambda picture: np.full_like(picture, 200), "is all of one colour.", 1.0),
+        (lambda picture: 255 - picture, "shows another camera, scene or light", 1.0),  # redrawn well, but not its table
     ],
 )
 def test_the_likely_cause_is_named(
@@ -169,5 +170,7 @@ def test_thresholds_decide(scene: np.ndarray) -> None:
     assert "is gray" in said(WorldModel(model), gray(scene))[0]
     model.config = replace(model.config, own_frames=OwnFrames(2, 1.0, 1.0, gray=True))
     assert not said(WorldModel(model), gray(scene))
+    model.config = replace(model.config, own_frames=OwnFrames(2, 9.0, 99.0))
+    assert "this parser has learnt too little (9 dB)" in said(WorldModel(model), scene)[0]
     model.config = replace(model.config, own_frames=OwnFrames(2, 99.0, 99.0))
     assert "another camera, scene or light" in said(WorldModel(model), scene)[0]

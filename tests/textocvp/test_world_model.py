@@ -177,6 +177,12 @@ def test_the_longest_horizon_works(placed_world_model: WorldModel, scene: np.nda
     assert placed_world_model.rollout(scene, TEXT, horizon=np.int64(8)).slots.shape[1] == 9
 
 
+@pytest.mark.parametrize("text", [None, 3, b"put the red block in the blue bowl", {"a": TEXT}])
+def test_a_text_of_another_kind_is_refused(placed_world_model, scene, text) -> None:
+    with pytest.raises(TypeError, match=f"give one text, or a list of texts, and not {type(text).__name__}"):
+        placed_world_model.rollout(scene, text, horizon=1)
+
+
 def test_a_word_it_has_never_met_is_a_warning_that_names_it(placed_world_model, scene) -> None:
     with pytest.warns(UserWarning, match="'flurb'") as caught:
         placed_world_model.rollout(scene, "put the flurb block in the blue bowl", horizon=1)

@@ -134,7 +134,7 @@ class TrainingSettings(RunPaths):
         for name, (least, most) in LIMITS.items():
             value = getattr(self, name, None)
             if value is not None and not least <= value <= most:
-                span = f"at least {least}" if most == math.inf else f"{least} to {most}"
+                span = f"at least {least}" + (f" and at most {most}" if most < math.inf else "")
                 raise SettingsError(f"--{name.replace('_', '-')} is {value}: must be {span}")
         for name in BEGINS_WITH:
             source = getattr(self, name, None)

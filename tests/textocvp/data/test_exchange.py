@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import imageio.v3 as iio
@@ -89,6 +91,16 @@ def test_episodes_without_actions_go_to_lerobot_alone(tmp_path: Path) -> None:
     with pytest.raises(OwnVideosError, match=r"own\.h5 has no actions, and Minari's episodes are of steps"):
         export(tmp_path / "own.h5", "minari", tmp_path / "own-v0")
     assert not (tmp_path / "own-v0").exists() and not (tmp_path / ".new-own-v0").exists()
+
+
+def test_minaris_files_are_begun_only_where_there_is_room(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """HDF5 ends the process when it finds none."""
+    pytest.importorskip("minari", reason="minari is not installed")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    with pytest.raises(OSError, match=r"need about .* MB, of which 0 are free: .*tabletop-v0") as refused:
+        export(file, "minari", file.parent / "tabletop-v0")
+    assert refused.value.errno == errno.ENOSPC
+    assert not list(file.parent.glob("*tabletop-v0*"))
 
 
 def test_minaris_own_library_opens_it(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,6 +149,11 @@ def test_sentences_of_the_captions_stay_as_they_are(name: str) -> None:
         f"don\N{RIGHT SINGLE QUOTATION MARK}t {PLAIN}",
         f"never {PLAIN}",
         "put nothing in the blue bowl",
+        "stop putting the red block in the blue bowl",
+        "refrain from putting the red block in the blue bowl",
+        "put the red block anywhere but in the blue bowl",
+        "keep the red block out of the blue bowl",
+        "leave the red block outside the blue bowl",
     ],
 )
 def test_a_negation_is_refused_with_its_text(placed_world_model: WorldModel, scene: np.ndarray, text: str) -> None:

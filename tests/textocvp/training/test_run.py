@@ -196,6 +196,72 @@ def test_settings_without_sense_are_refused_before_anything_is_written(folder: P
     assert not (folder / "senseless").exists()
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("learning_rate", 0.0),
+        ("learning_rate", float("inf")),
+        ("learning_rate", 1e30),
+        ("learning_rate", float("nan")),
+        ("clip_norm", 0.0),
+        ("batch", 10**8),
+        ("seed", 2**64),
+    ],
+)
+def test_settings_that_teach_nothing_or_too_much_are_refused(folder: Path, setting: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=f"--{setting.replace('_', '-')} is .*: must be at least .*"):
+        predictor_run(folder, "senseless", **{setting: value})
+    assert not (folder / "senseless").exists()
+
+
+def test_weights_of_pixels_are_not_negative(folder: Path) -> None:
+    with pytest.raises(SettingsError, match=r"--thing-weight is -5\.0: must be at least 0\.0"):
+        parser_run(folder, "senseless", thing_weight=-5.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("settings.json", b'{"episodes": 20'),
+        ("state/model.safetensors", b"xxxx"),
+        ("state/optimizer.bin", b"x"),
+        ("state/step.json", b'{"next_step": "one"}'),
+    ],
+)
+def test_a_damaged_run_is_said_and_may_be_thrown_away(folder: Path, name: str, content: bytes) -> None:
+    run = predictor_run(folder, "damaged", steps=1)
+    train(run)
+    (run.out / name).write_bytes(content)
+    with pytest.raises(SettingsError, match=r"damaged holds a run that cannot be gone on with: .* --fresh"):
+        train(replace(run, steps=2))
+    assert (run.out / name).read_bytes() == content
+    train(replace(run, steps=2, fresh=True))
+
+
+def test_a_finished_run_says_that_nothing_is_trained(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = predictor_run(folder, "finished", steps=1)
+    train(run)
+    assert "is finished" not in capsys.readouterr().out
+    train(run)
+    assert "is finished (1 updates): nothing more is trained" in capsys.readouterr().out
+
+
+def test_weights_that_are_no_numbers_are_never_saved(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An update may break them although its own gradient was finite."""
+    update = Run.update
+
+    def broken(self: Run, step: int, metrics: object = None) -> None:
+        update(self, step)
+        with torch.no_grad():
+            next(self.module.parameters()).fill_(float("inf"))
+
+    monkeypatch.setattr(Run, "update", broken)
+    run = predictor_run(folder, "broken", steps=1)
+    with pytest.raises(DivergedError, match="before step 1: a weight is not finite"):
+        train(run)
+    assert not (run.out / "state").exists() and not (run.out / "checkpoint").exists()
+
+
 def test_a_run_that_diverges_ends_and_keeps_its_last_good_state(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = predictor_run(folder, "diverging", steps=2)
     train(run)
