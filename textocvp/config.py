@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
+from importlib import import_module
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from textocvp.inputs import OwnFrames
@@ -164,3 +165,9 @@ def _checked(value: Any, hint: Any, path: str) -> Any:
     if hint is float and math.isnan(value):
         raise ValueError(f"{path} is not a number")
     return value
+
+
+def __getattr__(name: str) -> Any:
+    if name == "preset":  # where it was before presets had a file of their own: programs of users say it
+        return getattr(import_module("textocvp.presets"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -28,3 +28,12 @@ def test_loading_a_model_imports_no_compiler() -> None:
     code = "import sys, textocvp; textocvp.WorldModel.from_pretrained(); print('torch._dynamo' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_names_of_old_still_lead_there() -> None:
+    from textocvp import config, data, episodes, presets
+
+    assert episodes.EpisodeFile is data.episodes.EpisodeFile
+    assert config.preset("cater") is presets.preset("cater")
+    with pytest.raises(AttributeError, match="no attribute 'presets'"):
+        _ = config.presets
