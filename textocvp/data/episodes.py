@@ -389,13 +389,13 @@ class EpisodeFile(Episodes):
         elif h5py.check_string_dtype(text.dtype) is None:
             wrong = f"its instructions must be sentences, not {text.dtype}"
         elif not np.array_equal(index["start"][:], np.cumsum(lengths[:]) - lengths[:]) or total != lengths[:].sum():
-            wrong = f"{total} frames, but its index tells {lengths[:].sum()}, which must stand one episode after another"
+            wrong = f"{total} frames, but its index tells {lengths[:].sum()}, which must stand one after another"
         else:
             shapes = {f"episode/{name}": (len(lengths),) for name in index}
             shapes |= dict.fromkeys(FRAME_ARRAYS, (total,)) | {"segmentation": frames.shape[:3]}
             for name, shape in shapes.items():
                 if name in file and file[name].shape[: len(shape)] != shape:
-                    wrong = f"{name} has shape {file[name].shape}, and there are {len(lengths)} episodes, {total} frames"
+                    wrong = f"{name} has shape {file[name].shape}, for {len(lengths)} episodes, {total} frames"
         if wrong:
             raise ValueError(f"{self.path} is damaged: {wrong}")
 

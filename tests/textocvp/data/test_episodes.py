@@ -261,20 +261,25 @@ DAMAGES = {
     "empty episode": ({"episode/length": [5, 7, 0], "episode/start": [0, 5, 12]}, "each at least 1"),
     "fractions": ({"episode/length": [4.0, 4.0, 4.0]}, "must be whole numbers"),
     "none": ({"frames": FRAMES[:0], "episode/length": np.zeros(0, int), "episode/start": []}, "it has no episode"),
-    "gaps": ({"episode/start": [0, 5, 8]}, "12 frames, but its index tells 12, which must stand one episode after"),
+    "gaps": ({"episode/start": [0, 5, 8]}, "12 frames, but its index tells 12, which must stand one after another"),
     "numbers": ({"episode/instruction": [1, 2, 3]}, "its instructions must be sentences, not int64"),
-    "too few": ({"episode/instruction": ["a", "b"]}, "episode/instruction has shape (2,), and there are 3 episodes"),
+    "too few": ({"episode/instruction": ["a", "b"]}, "episode/instruction has shape (2,), for 3 episodes"),
     "no text": ({"episode/instruction": [b"a", b"b", b"\xff"]}, "codec can't decode"),
     "other seeds": ({"episode/seed": [1, 2]}, "episode/seed has shape (2,)"),
     "other masks": ({"segmentation": FRAMES[:, :8, :, 0]}, "segmentation has shape (12, 8, 16)"),
-    "other actions": ({"action": np.zeros((11, 5))}, "action has shape (11, 5), and there are 3 episodes, 12 frames"),
+    "other actions": ({"action": np.zeros((11, 5))}, "action has shape (11, 5), for 3 episodes, 12 frames"),
 }
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_arrays_that_do_not_fit_are_named_on_opening(tmp_path: Path, kind: str) -> None:
     damage, said = DAMAGES[kind]
-    whole = {"frames": FRAMES, "episode/length": [4, 4, 4], "episode/start": [0, 4, 8], "episode/instruction": ["x"] * 3}
+    whole = {
+        "frames": FRAMES,
+        "episode/length": [4, 4, 4],
+        "episode/start": [0, 4, 8],
+        "episode/instruction": ["x"] * 3,
+    }
     for name, arrays in {"whole": whole, "damaged": whole | damage}.items():
         with h5py.File(tmp_path / f"{name}.h5", "w") as file:
             file.attrs.update({"format": "textocvp-episodes", "format_version": 2})
