@@ -149,6 +149,8 @@ class ImportCommand:
     """Cut off what does not fit a square; otherwise it gets a border."""
     every: int = 1
     """Take every so many frames."""
+    fps: float | None = None
+    """Take so many frames a second of each video, so that all have the same rate; not more than a video has."""
     camera: str | None = None
     """Whose pictures to take of a LeRobot set with several cameras; by default the first's."""
 
@@ -323,11 +325,10 @@ def _data(arguments: list[str]) -> int:
     )
     try:
         if isinstance(action, ImportCommand):
-            how: dict[str, Any] = {"size": action.size, "crop": action.crop, "every": action.every}
-            if exchange.kind_of(action.source) == "videos":
-                done = own_videos.import_videos(action.source, action.out, **how | {"size": action.size or 64})
-            else:
-                done = exchange.import_set(action.source, action.out, **how, camera=action.camera)
+            done = exchange.import_set(
+                action.source, action.out, size=action.size, crop=action.crop, every=action.every, fps=action.fps,
+                camera=action.camera,
+            )  # fmt: skip
             for line in done.left_out:
                 print(f"left out: {line}", file=sys.stderr)
             print("\n".join([*done.lines, f"wrote {action.out}: {done.episodes} episodes, {done.frames} frames"]))

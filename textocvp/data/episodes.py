@@ -20,6 +20,8 @@ from textocvp.text.wording import split
 FORMAT = "textocvp-episodes"
 FORMAT_VERSIONS = (1, 2)
 
+FRAME_ARRAYS = ("arm", "gripper", "action", "reward", "state", "object_position")  # a row for each frame
+
 ROBOT, FIRST_OBJECT = 1, 2  # labels in segmentations of version 1
 
 
@@ -207,20 +209,15 @@ class EpisodeFile(Episodes):
         try:
             file = self._open()
             self._version = self._check_format(file)
+            self._check_arrays(file)
             index = file["episode"]
-            self.lengths: NDArray[np.int64] = index["length"][:]
+            self.lengths: NDArray[np.int64] = index["length"][:].astype(np.int64)
             self.instructions: tuple[str, ...] = tuple(index["instruction"].asstr()[kept])
             self.seeds: NDArray[np.int64] | None = index["seed"][kept] if "seed" in index else None
             self.success: NDArray[np.bool_] | None = index["success"][kept] if "success" in index else None
             self.image_size = int(file["frames"].shape[1])
             self.split = str(file.attrs.get("split", ""))
-            total = file["frames"].shape[0]
-            if total != self.lengths.sum() or not np.array_equal(index["start"][:], self.starts):
-                raise ValueError(
-                    f"{self.path} is damaged: {total} frames, but its index tells {self.lengths.sum()}, which must "
-                    "stand one episode after another"
-                )
-        except (OSError, KeyError) as error:
+        except (OSError, KeyError, TypeError, AttributeError, UnicodeError) as error:
             self.close()
             raise ValueError(f"{self.path} is not an episode file, or is damaged: {error}") from error
         except ValueError:
@@ -377,6 +374,30 @@ class EpisodeFile(Episodes):
                 f"collect the episodes again with: python -m textocvp.envs.collect"
             )
         return int(version)
+
+    def _check_arrays(self, file: h5py.File) -> None:
+        """A ValueError where frames and index are not as docs/data.md lays them out."""
+        frames, index = file["frames"], file["episode"]
+        lengths, text = index["length"], index["instruction"]
+        total, wrong = frames.shape[0] if frames.shape else 0, ""
+        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or frames.shape[1] != frames.shape[2]:
+            wrong = f"frames must be uint8 (N, H, H, 3), square and RGB, not {frames.dtype} {frames.shape}"
+        elif lengths.dtype.kind not in "iu" or lengths.ndim != 1 or (lengths[:] < 1).any():
+            wrong = "the lengths of its episodes must be whole numbers (E,), each at least 1"
+        elif not len(lengths):
+            wrong = "it has no episode"
+        elif h5py.check_string_dtype(text.dtype) is None:
+            wrong = f"its instructions must be sentences, not {text.dtype}"
+        elif not np.array_equal(index["start"][:], np.cumsum(lengths[:]) - lengths[:]) or total != lengths[:].sum():
+            wrong = f"{total} frames, but its index tells {lengths[:].sum()}, which must stand one after another"
+        else:
+            shapes = {f"episode/{name}": (len(lengths),) for name in index}
+            shapes |= dict.fromkeys(FRAME_ARRAYS, (total,)) | {"segmentation": frames.shape[:3]}
+            for name, shape in shapes.items():
+                if name in file and file[name].shape[: len(shape)] != shape:
+                    wrong = f"{name} has shape {file[name].shape}, for {len(lengths)} episodes, {total} frames"
+        if wrong:
+            raise ValueError(f"{self.path} is damaged: {wrong}")
 
 
 def swapped_questions(

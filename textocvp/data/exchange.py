@@ -9,6 +9,7 @@ import io
 import json
 import re
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,7 +26,15 @@ from PIL import Image
 from textocvp.data.cater import CaterEpisodes
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeFile, Episodes
-from textocvp.data.own_videos import Imported, OwnVideosError, to_square, video_frames, write_episodes
+from textocvp.data.own_videos import (
+    Imported,
+    OwnVideosError,
+    import_videos,
+    to_square,
+    too_long,
+    video_frames,
+    write_episodes,
+)
 
 Target = Literal["lerobot", "minari"]
 CAMERA = "observation.images.rgb"
@@ -61,14 +70,18 @@ def kind_of(source: Path) -> str:
 
 
 def import_set(
-    source: Path, out: Path, *, size: int | None = None, crop: bool = False, every: int = 1, camera: str | None = None
-) -> Imported:
-    """Write an episode file of a set of LeRobot or Minari, or of npz files. Frames stay as they are, bit for bit.
+    source: Path, out: Path, *, size: int | None = None, crop: bool = False, every: int = 1, fps: float | None = None,
+    camera: str | None = None,
+) -> Imported:  # fmt: skip
+    """Write an episode file of videos, npz files, or a set of LeRobot, Minari or CATER.
+
+    The frames of sets stay as they are, bit for bit; `import_videos` says what becomes of videos.
 
     Args:
-        size: height and width of the frames; by default their own.
+        size: height and width of the frames; by default 64 for videos and CATER, and else their own.
         crop: where they are brought to `size`, cut off what does not fit the square.
         every: take every so many frames. Actions are left out then.
+        fps: take so many frames a second, of videos.
         camera: key of the pictures, of LeRobot; by default its first.
 
     Raises:
@@ -77,6 +90,12 @@ def import_set(
     if every < 1 or (size is not None and size < 8):
         raise OwnVideosError(f"size must be at least 8 and every at least 1, not {size} and {every}")
     done, kind = Imported(), kind_of(source)
+    if camera is not None and kind != "lerobot":
+        raise OwnVideosError(f"{source} is of the kind {kind}, and only LeRobot sets have a choice of --camera")
+    if kind == "videos":
+        return import_videos(source, out, size=64 if size is None else size, crop=crop, every=every, fps=fps)
+    if fps is not None:
+        raise OwnVideosError(f"{source} is of the kind {kind}, whose episodes have one rate: take --every, not --fps")
     try:
         if kind == "lerobot":
             found = _from_lerobot(source, camera, done)
@@ -89,7 +108,7 @@ def import_set(
             else:
                 read = CliportEpisodes(source)
             found = _whole_ones(read, done)
-        changed = (_changed(episode, size, crop, every, done) for episode in found)
+        changed = (_changed(episode, number, size, crop, every, done) for number, episode in enumerate(found))
         done.episodes, done.frames = write_episodes(out, changed)
     except OwnVideosError as error:
         raise OwnVideosError(f"{source}: {error}") from error
@@ -111,7 +130,7 @@ def _whole_ones(episodes: Episodes, done: Imported) -> Iterator[Episode]:
             done.left_out.append(str(error))
 
 
-def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: Imported) -> Episode:
+def _changed(episode: Episode, number: int, size: int | None, crop: bool, every: int, done: Imported) -> Episode:
     _, H, W, _ = episode.frames.shape
     if not episode.instruction.strip():
         raise OwnVideosError("an episode has no sentence")
@@ -119,8 +138,11 @@ def _changed(episode: Episode, size: int | None, crop: bool, every: int, done: I
         raise OwnVideosError(f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)")
     if size not in (None, H) or H != W:
         frames, said = to_square(episode.frames, size or H, crop)
+        if episode.segmentation is not None or episode.objects:
+            said.append("left out its masks, objects, positions and questions, which are of the frames as they were")
         episode = replace(episode, frames=frames, segmentation=None, position=None, objects=(), questions=())
         done.say("this set", said)
+    done.say(f"episode {number}", too_long(-(-len(episode.frames) // every)))
     if every == 1:
         return episode
     done.say("this set", [f"left out its actions and rewards, for --every {every} takes frames away"])
@@ -157,11 +179,12 @@ def export(file: Path, to: Target, out: Path, fps: int = 15) -> list[str]:
 def _new_folder(out: Path) -> Iterator[Path]:
     if out.exists():
         raise OwnVideosError(f"{out} exists already: choose another --out, or delete it")
-    new = out.absolute().with_name(f".new-{out.name}")
-    shutil.rmtree(new, ignore_errors=True)  # of a run that was killed
+    new = out.absolute().with_name(f".new-{uuid.uuid4().hex}-{out.name}")  # another export may write the same
     new.mkdir(parents=True)
     try:
         yield new
+        if out.exists():
+            raise OwnVideosError(f"{out} was written by another process meanwhile: choose another --out, or delete it")
         new.rename(out)
     except BaseException:
         shutil.rmtree(new, ignore_errors=True)

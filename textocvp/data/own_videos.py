@@ -2,9 +2,11 @@
 
 import csv
 import hashlib
+import io
 import json
 import re
 import subprocess
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +16,7 @@ import imageio.v3 as iio
 import numpy as np
 from imageio_ffmpeg import get_ffmpeg_exe
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 from tqdm import tqdm
 
 from textocvp.data.episodes import FORMAT, FORMAT_VERSIONS, Episode, Episodes, words_of
@@ -28,6 +30,7 @@ SHOWN, MOMENTS = 12, 6  # episodes of a contact sheet, and frames of each
 LEAST_SHOWN, STRIP = 96, 18  # pixels: height of its frames, and of the line with the sentence above them
 WINDOW = 24  # frames that a predictor looks ahead while it learns, unless it is told otherwise
 ROOM = 16  # objects of an episode, at most
+SAME_RATE = 1.01  # 29.97 frames a second are called 30
 HEADER_TRUST = 0.9  # fewer frames than this share of what the header says, and two: the file was cut short
 
 
@@ -42,19 +45,18 @@ class Imported:
     episodes: int = 0
     frames: int = 0
     left_out: list[str] = field(default_factory=list)  # a line for each video that was not taken
-    done: dict[str, list[str]] = field(default_factory=dict)  # what had to be changed or is doubtful: of which videos
+    done: dict[str, dict[str, None]] = field(default_factory=dict)  # what was changed or is doubtful: of which videos
 
     def say(self, name: str, what: Sequence[str]) -> None:
         """Note what was done to a video."""
         for one in what:
-            if name not in (names := self.done.setdefault(one, [])):
-                names.append(name)
+            self.done.setdefault(one, {})[name] = None
 
     @property
     def lines(self) -> list[str]:
         """A line for each thing that was done, with the first video of which it is true."""
         more = {what: f" and {len(names) - 1} more" if len(names) > 1 else "" for what, names in self.done.items()}
-        return [f"{names[0]}{more[what]}: {what}" for what, names in self.done.items()]
+        return [f"{next(iter(names))}{more[what]}: {what}" for what, names in self.done.items()]
 
 
 def read_captions(folder: Path) -> dict[str, str]:
@@ -69,75 +71,137 @@ def read_captions(folder: Path) -> dict[str, str]:
     path = next((folder / name for name in CAPTIONS if (folder / name).is_file()), None)
     if path is None:
         raise OwnVideosError(f"{folder} has no captions: one of {', '.join(CAPTIONS)} must say what happens in each")
+    found: dict[str, str] = {}
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        if path.suffix == ".json":
-            found = json.loads(text)
-        elif path.suffix == ".csv":
-            found = {row[0]: ",".join(row[1:]) for row in csv.reader(text.splitlines()) if row}
-        else:
-            lines = [line.strip() for line in text.splitlines() if line.strip()]
-            found = dict(line.split("\t" if "\t" in line else None, maxsplit=1) for line in lines)
-        if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
-            raise ValueError("it must hold a sentence for each name")
-    except (ValueError, IndexError) as error:
+        for name, sentence in _rows(path.suffix, path.read_text(encoding="utf-8-sig")):
+            name, sentence = nfc(name.strip()), " ".join(sentence.split())
+            if found.setdefault(name, sentence) != sentence:
+                raise ValueError(f"two sentences for {name}: {found[name]!r} and {sentence!r}")
+            check_sentence(sentence, name)
+    except ValueError as error:
         raise OwnVideosError(f"{path} cannot be read: {error}") from error
-    return {name.strip(): " ".join(sentence.split()) for name, sentence in found.items()}
+    return found
 
 
-def import_videos(source: Path, out: Path, *, size: int = 64, crop: bool = False, every: int = 1) -> Imported:
+def _rows(ending: str, text: str) -> Iterator[tuple[str, str]]:
+    """The names and sentences of captions, in their order. A ValueError says what is wrong, and where."""
+    if ending == ".json":
+        rows = json.loads(text, object_pairs_hook=tuple)  # which keeps what is there twice
+        if not isinstance(rows, tuple) or not all(isinstance(sentence, str) for _, sentence in rows):
+            raise ValueError("it must hold a sentence for each name")
+        yield from rows
+    elif ending == ".csv":
+        reader = csv.reader(io.StringIO(text), strict=True)
+        try:
+            yield from ((row[0], ",".join(row[1:])) for row in reader if row)
+        except csv.Error as error:  # a quote that never ends, for one, would swallow the lines after it
+            raise ValueError(f"line {reader.line_num}: {error}") from error
+    else:
+        for line in filter(None, map(str.strip, text.splitlines())):
+            name, *sentence = line.split("\t" if "\t" in line else None, maxsplit=1)
+            yield name, "".join(sentence)
+
+
+def check_sentence(sentence: str, name: str) -> None:
+    """An OwnVideosError that names the video if no file can hold its sentence."""
+    if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in sentence):
+        raise OwnVideosError(f"the sentence of {name} has a character that is none (NUL or half a pair): {sentence!r}")
+
+
+def nfc(name: str) -> str:
+    """A name as it is compared: macOS writes u and two dots, where others write one letter."""
+    return unicodedata.normalize("NFC", name)
+
+
+def import_videos(
+    source: Path, out: Path, *, size: int = 64, crop: bool = False, every: int = 1, fps: float | None = None
+) -> Imported:
     """Write an episode file of the videos in a folder: video files, and folders of pictures in the order of names.
 
     Args:
         size: height and width of the frames in the file; pictures of other shapes get a border.
         crop: cut off what does not fit the square instead.
         every: take every so many frames.
+        fps: take so many frames a second instead, the nearest in time. A video with fewer, or of which nobody knows how
+            many it has (a folder of pictures), is left out.
 
     Raises:
-        OwnVideosError: if there is no video, no captions, or no video that can be used; nothing is written then.
+        OwnVideosError: if a number is out of range, there is no video, no captions, or no video that can be used;
+            nothing is written then.
     """
     if not source.is_dir():
         raise OwnVideosError(f"{source} is no folder of videos")
     if size < 8 or every < 1:
         raise OwnVideosError(f"size must be at least 8 and every at least 1, not {size} and {every}")
+    if fps is not None and (every > 1 or not 0 < fps < np.inf):
+        raise OwnVideosError(f"fps must be above 0, and without every, which takes frames too, not {fps} and {every}")
     captions, done = read_captions(source), Imported()
     videos = [one for one in _seen(source) if one.suffix.lower() in VIDEOS or one.is_dir()]
     if not videos:
         raise OwnVideosError(f"{source} has no video ({', '.join(VIDEOS)}) and no folder of pictures")
-    done.episodes, done.frames = write_episodes(out, _read_videos(source, videos, captions, size, crop, every, done))
+    episodes = _read_videos(source, videos, captions, size, crop, every, fps, done)
+    done.episodes, done.frames = write_episodes(out, episodes)
     return done
 
 
 def _read_videos(
-    source: Path, videos: list[Path], captions: dict[str, str], size: int, crop: bool, every: int, done: Imported
-) -> Iterator[Episode]:
+    source: Path, videos: list[Path], captions: dict[str, str], size: int, crop: bool, every: int, fps: float | None,
+    done: Imported,
+) -> Iterator[Episode]:  # fmt: skip
     """The videos that can be used; of the others `done` says why."""
-    used = 0
+    used, rates, names = 0, dict[str, float](), {nfc(path.name) for path in videos}
     for path in tqdm(videos, desc="videos", unit="video"):
-        sentence = captions.get(path.name) or captions.get(path.stem)
+        own, stem = nfc(path.name), nfc(path.stem)
+        sentence = captions.get(own) or captions.get(stem)
         if not sentence:
             done.left_out.append(f"{path.name}: the captions have no sentence for it")
             continue
+        if stem not in names and captions.get(stem, sentence) != sentence:
+            done.left_out.append(f"{path.name}: the captions have two sentences for it, one for {stem}")
+            continue
         try:
-            video, said = read_video(path, size, crop, every)
+            video, said, rate = read_video(path, size, crop, every, fps)
+            if len(video) < 2:
+                raise OwnVideosError(f"{len(video)} frames, and an episode needs at least 2")
         except Exception as error:  # decoders raise whatever they like
-            done.left_out.append(f"{path.name}: it cannot be read ({str(error).splitlines()[0][:120]})")
-            continue
-        if len(video) < 2:
-            done.left_out.append(f"{path.name}: {len(video)} frames, and an episode needs at least 2")
-            continue
-        if len(video) > WINDOW + 1:
-            said.append(
-                f"longer than {WINDOW + 1} frames, after which the predictor stops looking: take --every, "
-                "or train it with more --frames"
+            why = str(error).splitlines()[0][:300]
+            done.left_out.append(
+                f"{path.name}: {why if isinstance(error, OwnVideosError) else f'it cannot be read ({why[:120]})'}"
             )
-        done.say(path.name, said)
+            continue
+        if fps is None and rate:
+            rates[path.name] = rate
+        done.say(path.name, said + too_long(len(video)))
         used += 1
         yield Episode(frames=video, instruction=sentence)
-    known = {name for path in videos for name in (path.name, path.stem)}
+    if rates and max(rates.values()) > SAME_RATE * min(rates.values()):
+        slow, fast = min(rates, key=lambda name: rates[name]), max(rates, key=lambda name: rates[name])
+        done.say("these videos", [
+            f"of different rates, {rates[slow]:g} frames a second in {slow} and {rates[fast]:g} in {fast}, so the same "
+            f"movement is slow in one and fast in another: --fps {rates[slow]:g} takes as many of each"
+        ])  # fmt: skip
+    known = {name for path in videos for name in (nfc(path.name), nfc(path.stem))}
+    for path in _seen(source):
+        if path in videos or path.name in CAPTIONS:
+            continue
+        if own := {nfc(path.name), nfc(path.stem)} & captions.keys() - known:
+            done.left_out.append(f"{path.name}: its ending is none of {', '.join(VIDEOS)}")
+            known |= own
+        else:
+            done.say(path.name, [f"passed over, for it is no video ({', '.join(VIDEOS)})"])
     done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
     if not used:
         raise OwnVideosError(f"no video of {source} can be used: {'; '.join(done.left_out)}")
+
+
+def too_long(length: int) -> list[str]:
+    """What to say of an episode of so many frames: nothing, if the predictor looks at all of them."""
+    if length <= WINDOW + 1:
+        return []
+    return [
+        f"longer than {WINDOW + 1} frames, after which the predictor stops looking: take --every, "
+        "or train it with more --frames"
+    ]
 
 
 def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
@@ -151,8 +215,9 @@ def write_episodes(out: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
     content = hashlib.sha256()
     total, robot, names = 0, None, ("frames", "segmentation", "action", "reward", "state")
     out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as new, hdf5_to_write(new) as file:
+    with replacing(out, out.parent) as new, hdf5_to_write(new) as file:
         for number, episode in enumerate(episodes):
+            check_sentence(episode.instruction, f"episode {number}")
             arrays = {name: v for name in names if (v := getattr(episode, name)) is not None}
             if episode.position is not None:
                 room = ((0, 0), (0, ROOM - episode.position.shape[1]), (0, 0))
@@ -200,11 +265,30 @@ def _seen(folder: Path) -> list[Path]:
     return [one for one in sorted(folder.iterdir()) if not one.name.startswith((".", "__MACOSX"))]
 
 
-def read_video(path: Path, size: int, crop: bool, every: int) -> tuple[NDArray[np.uint8], list[str]]:
-    """Frames (T, size, size, 3), and what was done to them, in words."""
+def read_video(
+    path: Path, size: int, crop: bool, every: int, fps: float | None = None
+) -> tuple[NDArray[np.uint8], list[str], float]:
+    """Frames (T, size, size, 3), every so many or `fps` a second, what was done to them, and frames a second it has.
+
+    The rate is 0 where nobody knows it: of folders of pictures, for one.
+    """
     said: list[str] = []
+    rate, seconds = (0.0, 0.0) if path.is_dir() else _header(path)
+    if fps is not None and fps > SAME_RATE * rate:
+        has = f"has {rate:g} frames a second" if rate else "does not say how many frames a second it has"
+        raise OwnVideosError(f"it {has}, and --fps {fps:g} was asked for" + ("" if rate else "; take --every"))
+    step = every if fps is None else max(1.0, rate / fps)
     if path.is_dir():
-        files = sorted((one for one in _seen(path) if one.suffix.lower() in PICTURES), key=_by_number)
+        seen = _seen(path)
+        files = sorted((one for one in seen if one.suffix.lower() in PICTURES), key=_by_number)
+        kinds, others = ({one.suffix.lower() for one in some} for some in (files, {*seen} - {*files}))
+        if len(kinds) > 1:
+            raise OwnVideosError(f"its pictures are of several kinds ({', '.join(sorted(kinds))}): keep one of them")
+        if others:
+            endings = ", ".join(sorted(ending or "names without an ending" for ending in others))
+            said.append(f"passed over what is no picture ({', '.join(PICTURES)}) in it: {endings}")
+        if not files:
+            raise OwnVideosError(f"no pictures ({', '.join(PICTURES)}) in it" + (f", only {endings}" if others else ""))
         read = [read_picture(one, None) for one in files[::every]]
         said += dict.fromkeys(what for _, of_one in read for what in of_one)
         frames = [frame for frame, _ in read]
@@ -213,18 +297,18 @@ def read_video(path: Path, size: int, crop: bool, every: int) -> tuple[NDArray[n
             raise ValueError(f"its pictures differ in size: {', '.join(sizes)}")
     else:
         frames, count = [], 0
-        for frame in video_frames(path):
-            if count % every == 0:
+        for frame in video_frames(path, None if fps is None else rate):
+            if count == int(len(frames) * step + 0.5):  # the nearest in time to the next that is wanted
                 frames.append(frame)
             count += 1
-        if (promised := _promised(path)) and count < min(HEADER_TRUST * promised, promised - 1):
+        if (promised := round(rate * seconds)) and count < min(HEADER_TRUST * promised, promised - 1):
             said.append(f"cut short: {count} of the {promised} frames that its header promises can be read")
         elif complaint := _complaint(path):
             said.append(f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}")
     if not frames:
-        return np.zeros((0, size, size, 3), np.uint8), said
+        return np.zeros((0, size, size, 3), np.uint8), said, rate
     whole, how = to_square(np.stack(frames), size, crop)
-    return whole, said + how
+    return whole, said + how, rate
 
 
 def to_square(frames_T: NDArray[np.uint8], size: int, crop: bool = False) -> tuple[NDArray[np.uint8], list[str]]:
@@ -235,13 +319,15 @@ def to_square(frames_T: NDArray[np.uint8], size: int, crop: bool = False) -> tup
     return whole, [how]
 
 
-def _promised(path: Path) -> int:
-    """The number of frames that follows from rate and duration in a video's header; 0 where it says nothing."""
+def _header(path: Path) -> tuple[float, float]:
+    """Frames a second and seconds that a video file tells; 0 for what it does not tell."""
     if path.suffix.lower() == ".gif":
-        return 0
+        with Image.open(path) as film:
+            lasts = {frame.info.get("duration", 0) for frame in ImageSequence.Iterator(film)}
+        return (1000 / lasts.pop() if len(lasts) == 1 and all(lasts) else 0.0), 0.0  # milliseconds of each frame
     header = iio.immeta(path, plugin="FFMPEG")
-    count = header.get("fps", 0) * header.get("duration", 0)
-    return round(count) if np.isfinite(count) else 0
+    rate, seconds = (float(value) if np.isfinite(value := header.get(name, 0)) else 0.0 for name in ("fps", "duration"))
+    return rate, seconds
 
 
 def _complaint(path: Path) -> str:
@@ -258,12 +344,12 @@ def _by_number(path: Path) -> list[tuple[bool, int, str]]:
     return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def video_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """The frames (H, W, 3) of a video file, RGB."""
+def video_frames(path: Path, rate: float | None = None) -> Iterator[NDArray[np.uint8]]:
+    """The frames (H, W, 3) of a video file, RGB; with `rate` so many a second, even where they last unequally."""
     if path.suffix.lower() == ".gif":
         yield from iio.imiter(path, mode="RGB")
     else:
-        yield from iio.imiter(path, plugin="FFMPEG")
+        yield from iio.imiter(path, plugin="FFMPEG", **({} if rate is None else {"fps": rate}))
 
 
 def describe(episodes: Episodes) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import pickle
+import re
 import time
 from pathlib import Path
 
@@ -245,6 +246,48 @@ def test_wrong_files_are_refused(path: Path, tmp_path: Path, opened) -> None:
         opened(short)
     with pytest.raises(ValueError, match="first must be at least 1 episode, not 0"):
         opened(path, 0)
+
+
+FRAMES = np.random.default_rng(0).integers(0, 256, (12, 16, 16, 3), np.uint8)
+DAMAGES = {
+    "0 to 1": ({"frames": FRAMES / np.float32(255)}, "frames must be uint8 (N, H, H, 3), square and RGB, not float32"),
+    "gray": ({"frames": FRAMES[..., 0]}, "not uint8 (12, 16, 16)"),
+    "one channel": ({"frames": FRAMES[..., :1]}, "not uint8 (12, 16, 16, 1)"),
+    "alpha": ({"frames": FRAMES[..., [0, 1, 2, 0]]}, "not uint8 (12, 16, 16, 4)"),
+    "channels first": ({"frames": FRAMES.transpose(0, 3, 1, 2)}, "not uint8 (12, 3, 16, 16)"),
+    "not square": ({"frames": FRAMES[:, :12]}, "not uint8 (12, 12, 16, 3)"),
+    "no array": ({"frames": 3}, "frames must be uint8"),
+    "negative": ({"episode/length": [9, -1, 4]}, "lengths of its episodes must be whole numbers (E,), each at least 1"),
+    "empty episode": ({"episode/length": [5, 7, 0], "episode/start": [0, 5, 12]}, "each at least 1"),
+    "fractions": ({"episode/length": [4.0, 4.0, 4.0]}, "must be whole numbers"),
+    "none": ({"frames": FRAMES[:0], "episode/length": np.zeros(0, int), "episode/start": []}, "it has no episode"),
+    "gaps": ({"episode/start": [0, 5, 8]}, "12 frames, but its index tells 12, which must stand one after another"),
+    "numbers": ({"episode/instruction": [1, 2, 3]}, "its instructions must be sentences, not int64"),
+    "too few": ({"episode/instruction": ["a", "b"]}, "episode/instruction has shape (2,), for 3 episodes"),
+    "no text": ({"episode/instruction": [b"a", b"b", b"\xff"]}, "codec can't decode"),
+    "other seeds": ({"episode/seed": [1, 2]}, "episode/seed has shape (2,)"),
+    "other masks": ({"segmentation": FRAMES[:, :8, :, 0]}, "segmentation has shape (12, 8, 16)"),
+    "other actions": ({"action": np.zeros((11, 5))}, "action has shape (11, 5), for 3 episodes, 12 frames"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_arrays_that_do_not_fit_are_named_on_opening(tmp_path: Path, kind: str) -> None:
+    damage, said = DAMAGES[kind]
+    whole = {
+        "frames": FRAMES,
+        "episode/length": [4, 4, 4],
+        "episode/start": [0, 4, 8],
+        "episode/instruction": ["x"] * 3,
+    }
+    for name, arrays in {"whole": whole, "damaged": whole | damage}.items():
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file.attrs.update({"format": "textocvp-episodes", "format_version": 2})
+            for key, values in arrays.items():
+                file[key] = values
+    assert len(open_episodes(tmp_path / "whole.h5")) == 3
+    with pytest.raises(ValueError, match=rf"damaged\.h5 is .*damaged: .*{re.escape(said)}"):
+        open_episodes(tmp_path / "damaged.h5")
 
 
 def test_a_folder_is_no_episode_file(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import pytest
 from textocvp.cli import main
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeFile
-from textocvp.data.exchange import export, import_set, kind_of
+from textocvp.data.exchange import _new_folder, export, import_set, kind_of
 from textocvp.data.own_videos import OwnVideosError, write_episodes
 
 SENTENCES = ("put the red block in the blue bowl", "lege den grünen Block in die Schüssel")
@@ -268,9 +268,37 @@ def test_cliports_folders_become_files_with_their_masks(tmp_path: Path) -> None:
         assert one.segmentation.tobytes() == wanted.segmentation.tobytes() and one.objects == wanted.objects
     done = import_set(folder, tmp_path / "half.h5", size=8, every=2)
     assert done.frames == 2 and "brought it from 16x16 to 8x8 pixels" in done.lines[0]
+    assert "this set: left out its masks, objects, positions and questions, which are of the frames as they were" in (
+        done.lines
+    )
     with h5py.File(tmp_path / "half.h5") as file:
         assert file["frames"].shape == (2, 8, 8, 3) and "segmentation" not in file
+    for option, said in ({"camera": "top"}, "only LeRobot sets have"), ({"fps": 5}, "take --every, not --fps"):
+        with pytest.raises(OwnVideosError, match=rf"npz is of the kind npz, .*{said}"):
+            import_set(folder, tmp_path / "half.h5", **option)
     shutil.copy(folder / "a.npz", folder / "b.npz")
     (folder / "b.npz").write_bytes((folder / "a.npz").read_bytes()[:500])
     with pytest.warns(UserWarning, match=r"left out: .*b\.npz"):
         assert import_set(folder, tmp_path / "own.h5").episodes == 1
+
+
+def test_sets_longer_than_the_predictor_looks_are_named(tmp_path: Path) -> None:
+    needs("lerobot")
+    frames = np.random.default_rng(0).integers(0, 256, (51, 16, 16, 3), np.uint8)
+    of_lengths = [Episode(frames=frames[:T], instruction=SENTENCES[0]) for T in (25, 26, 51)]
+    write_episodes(tmp_path / "own.h5", of_lengths)
+    export(tmp_path / "own.h5", "lerobot", tmp_path / "set")
+    (line,) = import_set(tmp_path / "set", tmp_path / "back.h5").lines
+    assert line.startswith("episode 1 and 1 more: longer than 25 frames, after which the predictor stops looking")
+    lines = import_set(tmp_path / "set", tmp_path / "half.h5", every=2).lines
+    assert any(line.startswith("episode 2: longer than 25 frames") for line in lines), "26 of 51, and 13 of 26"
+
+
+def test_two_exports_at_once_do_not_mix(file: Path) -> None:
+    needs("lerobot")
+    out = file.parent / "set"
+    with pytest.raises(OwnVideosError, match="was written by another process meanwhile"), _new_folder(out):
+        export(file, "lerobot", out)
+    import_set(out, file.parent / "back.h5")
+    assert_same(file.parent / "back.h5", episodes())
+    assert {p.name for p in file.parent.iterdir()} == {"own.h5", "back.h5", "set"}

@@ -17,7 +17,15 @@ import pytest
 
 from textocvp.cli import main
 from textocvp.data import open_episodes
-from textocvp.data.own_videos import OwnVideosError, contact_sheet, import_videos, problems, read_captions
+from textocvp.data.episodes import Episode
+from textocvp.data.own_videos import (
+    OwnVideosError,
+    contact_sheet,
+    import_videos,
+    problems,
+    read_captions,
+    write_episodes,
+)
 
 PAGE = Path(__file__).parents[3] / "docs/own-videos.md"
 SENTENCES = ("put the red block in the blue bowl", "put the green block in the blue bowl")
@@ -128,6 +136,147 @@ def test_captions_of_every_kind(tmp_path: Path) -> None:
     (tmp_path / "captions.json").write_text('{"a": 3}')
     with pytest.raises(OwnVideosError, match=r"captions\.json cannot be read: it must hold a sentence"):
         read_captions(tmp_path)
+
+
+def test_line_breaks_and_names_without_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "captions.csv").write_text('a,"put the red block\n in the bowl"\nb\n')
+    assert read_captions(tmp_path) == {"a": "put the red block in the bowl", "b": ""}
+    (tmp_path / "captions.csv").unlink()
+    (tmp_path / "captions.txt").write_text("a put it there\nb\n")
+    assert read_captions(tmp_path) == {"a": "put it there", "b": ""}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("captions.csv", "a,put it there\na,and back\n", "two sentences for a: 'put it there' and 'and back'"),
+        ("captions.txt", "a put it there\na and back\n", "two sentences for a: 'put it there' and 'and back'"),
+        ("captions.json", '{"a": "put it there", "a": "and back"}', "two sentences for a:"),
+        ("captions.csv", "B\u00fc,put it there\nBu\u0308,and back\n", "two sentences for B\u00fc:"),
+        ("captions.csv", 'a,put it there\nb,"and back\nc,put it there\n', "line 3: unexpected end of data"),
+        (
+            "captions.json",
+            '{"a": "put \\u0000 it"}',
+            r"the sentence of a has a character that is none .*: 'put \\x00 it",
+        ),
+        ("captions.json", '{"a": "put \\ud800 it"}', "the sentence of a has a character that is none"),
+        ("captions.json", '[["a", "put it there"]]', "it must hold a sentence for each name"),
+        ("captions.json", '{"a": {"b": "put it there"}}', "it must hold a sentence for each name"),
+    ],
+)
+def test_captions_that_cannot_be_meant_are_refused(tmp_path: Path, name: str, text: str, said: str) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(OwnVideosError, match=rf"{re.escape(name)} cannot be read: {said}"):
+        read_captions(tmp_path)
+
+
+def test_the_same_line_twice_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "captions.csv").write_text("a,put it  there\na,put it there\n")
+    assert read_captions(tmp_path) == {"a": "put it there"}
+
+
+def test_no_file_takes_half_a_character(tmp_path: Path) -> None:
+    with pytest.raises(OwnVideosError, match="the sentence of episode 0 has a character that is none"):
+        write_episodes(tmp_path / "own.h5", [Episode(frames=video(0), instruction="put \0 it")])
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_are_matched_however_they_are_composed(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "videos", 3)
+    (folder / "0000").rename(folder / "bu\u0308cher")  # as macOS writes it
+    (folder / "0001").rename(folder / "k\u00fcche")
+    rows = f"b\u00fccher,{SENTENCES[0]}\nku\u0308che,{SENTENCES[1]}\n0002,{SENTENCES[0]}\n"
+    (folder / "captions.csv").write_text(rows, encoding="utf-8")
+    done = import_videos(folder, tmp_path / "own.h5")
+    assert done.episodes == 3 and not done.left_out
+
+
+def test_a_sentence_with_the_ending_and_another_without(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "videos", 2)
+    rows = f"0000,{SENTENCES[0]}\n0001.mp4,{SENTENCES[0]}\n0001,{SENTENCES[1]}\n"
+    (folder / "captions.csv").write_text(rows)
+    assert import_videos(folder, tmp_path / "own.h5").left_out == [
+        "0001.mp4: the captions have two sentences for it, one for 0001"
+    ]
+    (folder / "0001").mkdir()
+    iio.imwrite(folder / "0001/0.png", video(1)[0]), iio.imwrite(folder / "0001/1.png", video(1)[1])
+    done = import_videos(folder, tmp_path / "own.h5")
+    assert done.episodes == 3 and not done.left_out, "each sentence has a video of its own"
+
+
+def test_frames_a_second(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    shades = np.arange(10, 250, 10, dtype=np.uint8)
+    frames = np.broadcast_to(shades[:, None, None, None], (24, 64, 64, 3))
+    for name, rate in {"fast.mp4": 30, "film.mp4": 24, "slow.mp4": 6}.items():
+        iio.imwrite(folder / name, frames, plugin="FFMPEG", fps=rate, quality=10)
+    iio.imwrite(folder / "even.gif", frames, duration=100)
+    (folder / "pictures").mkdir()
+    iio.imwrite(folder / "pictures/0.png", frames[0]), iio.imwrite(folder / "pictures/1.png", frames[1])
+    (folder / "captions.json").write_text(
+        json.dumps(dict.fromkeys(["fast", "film", "slow", "even", "pictures"], "put it"))
+    )
+    command = ["data", "import", str(folder), "--out", str(tmp_path / "own.h5")]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "these videos: of different rates, 6 frames a second in slow.mp4 and 30 in fast.mp4" in said
+    assert main([*command, "--fps", "9"]) == 0
+    out, error = capsys.readouterr()
+    assert "of different rates" not in out
+    assert "left out: slow.mp4: it has 6 frames a second, and --fps 9 was asked for" in error
+    assert "left out: pictures: it does not say how many frames a second it has" in error
+    with open_episodes(tmp_path / "own.h5") as episodes:
+        for index, rate in enumerate((10, 30, 24)):  # even, fast, film
+            seen = (episodes.frames(index).mean((1, 2, 3)) / 10 - 1).round().astype(int)
+            times = np.arange(len(seen)) / 9
+            assert np.abs(seen / rate - times).max() <= 0.5 / rate + 1e-9, "the nearest frame"
+            assert (23 - seen[-1]) / rate < 1 / 9 + 1 / rate, "to the end"
+    for wrong in (["--fps", "0"], ["--fps", "nan"], ["--fps", "5", "--every", "2"]):
+        assert main([*command, *wrong]) == 1
+        assert "fps must be above 0, and without every" in capsys.readouterr().err
+
+
+def test_options_that_mean_nothing_are_refused(tmp_path: Path, capsys) -> None:
+    command = ["data", "import", str(fill(tmp_path / "videos", 2)), "--out", str(tmp_path / "own.h5")]
+    assert main([*command, "--size", "0"]) == 1 and "size must be at least 8" in capsys.readouterr().err
+    assert main([*command, "--camera", "wrist"]) == 1
+    assert "of the kind videos, and only LeRobot sets have a choice of --camera" in capsys.readouterr().err
+    assert not (tmp_path / "own.h5").exists()
+
+
+def test_pictures_of_two_kinds_and_unknown_endings(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "videos", 4)
+    for frame in range(12):
+        iio.imwrite(folder / f"0000/frame_{frame}.jpg", video(0)[frame])
+        (folder / f"0001/frame_{frame}.png").rename(folder / f"0001/frame_{frame}.tif")
+    (folder / "0002/notes.txt").write_text("of the camera")
+    (folder / "0004.mpg").write_bytes(b"")
+    with open(folder / "captions.csv", "a") as file:
+        file.write("0004.mpg,put it there\n")
+    done = import_videos(folder, tmp_path / "own.h5")
+    pictures, videos = ".png, .jpg, .jpeg, .bmp, .webp", ".mp4, .avi, .mov, .mkv, .webm, .gif"
+    assert done.left_out == [
+        "0000: its pictures are of several kinds (.jpg, .png): keep one of them",
+        f"0001: no pictures ({pictures}) in it, only .tif",
+        f"0004.mpg: its ending is none of {videos}",
+    ]
+    assert f"0002: passed over what is no picture ({pictures}) in it: .txt" in done.lines and done.episodes == 2
+
+
+def test_two_imports_at_once_each_write_a_file_of_their_own(tmp_path: Path) -> None:
+    episodes = [Episode(frames=video(number), instruction=SENTENCES[number]) for number in range(2)]
+
+    def slowly():
+        yield episodes[0]
+        write_episodes(tmp_path / "own.h5", [episodes[1]])  # another begins and ends meanwhile
+        yield episodes[0]
+
+    assert write_episodes(tmp_path / "own.h5", slowly()) == (2, 24)
+    with open_episodes(tmp_path / "own.h5") as found:
+        assert found.instructions == (SENTENCES[0],) * 2
+        np.testing.assert_array_equal(found.clips(found.starts, 12), np.stack([video(0)] * 2))
+    assert [one.name for one in tmp_path.iterdir()] == ["own.h5"]
 
 
 def test_what_cannot_be_used_is_named_and_nothing_half_written_stays(tmp_path: Path) -> None:
