@@ -349,7 +349,8 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[NDArray[np.u
     if path.suffix.lower() == ".gif":
         yield from iio.imiter(path, mode="RGB")
     else:
-        yield from iio.imiter(path, plugin="FFMPEG", **({} if rate is None else {"fps": rate}))
+        options: dict[str, Any] = {} if rate is None else {"fps": rate}
+        yield from iio.imiter(path, plugin="FFMPEG", **options)
 
 
 def describe(episodes: Episodes) -> list[str]:
