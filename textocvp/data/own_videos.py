@@ -184,9 +184,9 @@ def _read_videos(
     for path in _seen(source):
         if path in videos or path.name in CAPTIONS:
             continue
-        if own := {nfc(path.name), nfc(path.stem)} & captions.keys() - known:
+        if named := {nfc(path.name), nfc(path.stem)} & captions.keys() - known:
             done.left_out.append(f"{path.name}: its ending is none of {', '.join(VIDEOS)}")
-            known |= own
+            known |= named
         else:
             done.say(path.name, [f"passed over, for it is no video ({', '.join(VIDEOS)})"])
     done.left_out += [f"{name}: there is no such video" for name in captions if name not in known]
