@@ -43,6 +43,8 @@ from textocvp.protocols import load_model
 from textocvp.text.pretrained import MINILM_PACKAGE, T5_HUB_ID, PretrainedTextConfig
 from textocvp.world_model import WorldModel
 
+PICTURES = (".png", ".jpg", ".jpeg")  # endings of a preview
+
 
 class Mistake(Exception):
     """Something the user can put right; shown without a traceback."""
@@ -340,6 +342,8 @@ def _data(arguments: list[str]) -> int:
                 print(f"left out: {line}", file=sys.stderr)
             print(f"wrote {action.out}")
             return 0
+        if isinstance(action, PreviewCommand) and action.out.suffix.lower() not in PICTURES:
+            raise Mistake(f"--out {action.out}: the name must end in {', '.join(PICTURES)}")
         with open_episodes(action.file) as episodes:
             if isinstance(action, CheckCommand):
                 found = own_videos.problems(episodes, action.window)

@@ -1,5 +1,6 @@
 """Files that replace others: whatever happens, the old one or the new one is there whole."""
 
+import errno
 import io
 import os
 import uuid
@@ -20,8 +21,12 @@ def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
             missing, on the same disk. What a killed process leaves there has a name of its own.
 
     Raises:
-        OSError: if there is no room, for example; it names `path`. Nothing half-written stays.
+        OSError: if there is no room, for example, or if `path` is a folder or a device, which is said before the block
+            is run; it names `path`. Nothing half-written stays.
     """
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "no ordinary file"
+        raise OSError(errno.EISDIR if path.is_dir() else errno.EINVAL, f"this is {what} and is not replaced", str(path))
     if folder is None:
         new = path.with_name(f".new-{path.name}")
     else:

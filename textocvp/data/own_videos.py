@@ -79,7 +79,8 @@ def read_captions(folder: Path) -> dict[str, str]:
                 raise ValueError(f"two sentences for {name}: {found[name]!r} and {sentence!r}")
             check_sentence(sentence, name)
     except ValueError as error:
-        raise OwnVideosError(f"{path} cannot be read: {error}") from error
+        hint = "; save it as UTF-8" if isinstance(error, UnicodeDecodeError) else ""
+        raise OwnVideosError(f"{path} cannot be read: {error}{hint}") from error
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -98,6 +99,27 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, w
     assert run.returncode == 1 and "File too large" in run.stderr and "Traceback" not in run.stderr, run.stderr
     assert sorted(one.name for one in tmp_path.iterdir()) == before
     assert not out.is_file() or out.read_text() == "old"
+
+
+def test_only_files_are_replaced_and_that_is_known_at_once(tmp_path: Path, capsys) -> None:
+    videos = fill(tmp_path / "videos")
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    for name, what in (("folder", "a folder"), ("pipe", "no ordinary file")):
+        assert main(["data", "import", str(videos), "--out", str(tmp_path / name)]) == 1
+        assert f"this is {what} and is not replaced: '{tmp_path / name}'" in capsys.readouterr().err
+    assert (tmp_path / "folder").is_dir() and (tmp_path / "pipe").is_fifo()
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["folder", "pipe", "videos"]
+
+
+def test_other_encodings_and_endings_are_named(tmp_path: Path, capsys) -> None:
+    videos = fill(tmp_path / "videos")
+    import_videos(videos, tmp_path / "made.h5")
+    assert main(["data", "preview", str(tmp_path / "made.h5"), "--out", str(tmp_path / "a.xyz")]) == 1
+    assert "a.xyz: the name must end in .png, .jpg, .jpeg" in capsys.readouterr().err
+    (videos / "captions.csv").write_text("0000,put it there\n", encoding="utf-16")
+    with pytest.raises(OwnVideosError, match=r"captions\.csv cannot be read: .*; save it as UTF-8"):
+        import_videos(videos, tmp_path / "other.h5")
 
 
 def test_the_commands_of_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
