@@ -119,7 +119,7 @@ def listen(host: str, port: int) -> socket.socket:
         raise Mistake(f"--port {port}: ports are numbers from 0 to 65535, and 0 takes a free one")
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-    except OSError:
+    except (OSError, UnicodeError):
         raise Mistake(f"--host {host}: this machine knows no such address") from None
     listening = socket.socket(family, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

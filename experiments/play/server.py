@@ -19,6 +19,8 @@ from fastapi import Body, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
+from pydantic import AfterValidator
+from starlette.exceptions import HTTPException
 
 from envs.colors import COLORS
 from experiments.play.links import Link, Refused
@@ -33,7 +35,19 @@ IDLE_SECONDS = 300.0  # a page says something every minute; one that is silent f
 # Nothing of another host is ever asked for.
 POLICY = "default-src 'self' data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; base-uri 'none'"
 MEDIA = {"gif": "image/gif", "mp4": "video/mp4", "png": "image/png", "html": "text/html"}
-Said = Annotated[str, Body(embed=True)]
+
+
+def _as_text(said: str) -> str:
+    """Half a character, which JSON can hold, can be neither read nor sent back."""
+    try:
+        said.encode()
+    except UnicodeEncodeError:
+        raise ValueError("it holds half a character") from None
+    return said
+
+
+Text = Annotated[str, AfterValidator(_as_text)]
+Said = Annotated[Text, Body(embed=True)]
 Number = Annotated[float, Body(embed=True)]
 
 
@@ -159,6 +173,10 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
         parts = [f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in error.errors()]
         return JSONResponse({"error": "the request is not as it should be: " + "; ".join(parts)}, 422)
 
+    @app.exception_handler(HTTPException)
+    def handle_no_page(_: Request, error: HTTPException) -> Response:
+        return JSONResponse({"error": error.detail}, error.status_code)
+
     @app.exception_handler(Exception)
     def handle_bug(_: Request, error: Exception) -> Response:
         said = f"this went wrong, and should not have: {type(error).__name__}. The terminal says more"
@@ -214,7 +232,7 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
         return ask(name, lambda session: session.table.add(kind, color))
 
     @app.post("/api/{name}/imagine")
-    def imagine(name: str, texts: Annotated[list[str], Body(embed=True)]) -> dict[str, Any]:
+    def imagine(name: str, texts: Annotated[list[Text], Body(embed=True)]) -> dict[str, Any]:
         return ask(name, lambda session: {"films": session.imagine(texts)}, view=False)
 
     @app.post("/api/{name}/do")

@@ -76,8 +76,9 @@ class Session:
         self.picture: np.ndarray | None = None  # a person's own, instead of the scene
         self.goal: Goal | PictureGoal | None = None
         self.before_goal: Link | None = None  # the scene, while the goal is arranged
-        self.goal_supports: tuple[int, ...] = ()  # of a goal that was arranged
+        self.goal_supports: Mapping[str, str] = {}  # of a goal that was arranged
         self.shown: list[Shown] = []  # what may be downloaded, in the order of the page
+        self.acts: list[Shown] = []  # that the page shows beside each other; plans are made between them
         try:
             self.world.show(link)
         except BaseException:
@@ -177,7 +178,7 @@ class Session:
         wish = self._read(text)
         imagined = self._imagined([text])
         done = replace(imagined, real=self.world.act(wish, imagined.rollout))
-        self.shown = [*(self.shown if more else ()), done]
+        self.acts = self.shown = [*(self.acts if more else ()), done]
         return {"film": self.films(done)[0], **self.goal_state()}
 
     def _read(self, text: str) -> Any:
@@ -223,7 +224,7 @@ class Session:
         if self.before_goal is None:
             raise Refused("no goal is being arranged")
         if what == "use":
-            self.goal, self.goal_supports = PictureGoal(table.rgb), tuple(table.info["supports"])
+            self.goal, self.goal_supports = PictureGoal(table.rgb), table.supports
         before, self.before_goal = self.before_goal, None
         table.show(before)
 
@@ -239,7 +240,7 @@ class Session:
 
     def _is_reached(self, goal: Goal | PictureGoal) -> bool:
         if isinstance(goal, PictureGoal):
-            return tuple(self.table.info["supports"]) == self.goal_supports
+            return self.table.supports == self.goal_supports
         return self.table.is_reached(goal)
 
     def _planner(self, goal: Goal | PictureGoal) -> SearchPlanner:

@@ -65,6 +65,13 @@ class Tabletop:
     # -- what is seen and said ---------------------------------------------------------------------------------
 
     @property
+    def supports(self) -> dict[str, str]:
+        """What carries each thing, by name: things that were taken away and added again have other numbers."""
+        names = [f"{item['color']} {item['kind']}" for item in self.info["objects"]]
+        known = {-1: "table", -2: ""} | dict(enumerate(names))
+        return dict(zip(names, (known[carrier] for carrier in self.info["supports"]), strict=True))
+
+    @property
     def camera(self) -> PinholeCamera:
         """That the scene is seen through."""
         return PinholeCamera.from_info(self.info["camera"])
