@@ -155,6 +155,23 @@ def test_a_goal_is_arranged_and_planned_for(open_page) -> None:
     assert page.ask("do", text=plan["sentences"][0])["reached"] == {"seen": True, "true": True}
 
 
+def test_an_arranged_goal_is_reached_whatever_numbers_its_things_had(open_page) -> None:
+    page = open_page("seed=3&family=plain")
+    at = {one["name"]: one for one in page.scene["things"]}
+    block, bowl = (next(name for name in at if kind in name) for kind in ("block", "bowl"))
+    page.ask("goal", what="begin")
+    page.ask("remove", thing=at[bowl]["id"])
+    added = page.ask("add", kind="bowl", color=bowl.split()[0])["scene"]["things"]
+    assert added[-1]["name"] == bowl and at[bowl]["id"] != added[-1]["id"]
+    place = page.ask("move", thing=added[-1]["id"], x=at[bowl]["at"][0], y=at[bowl]["at"][1])["scene"]["things"][-1][
+        "at"
+    ]
+    number = next(one["id"] for one in added if one["name"] == block)
+    page.ask("move", thing=number, x=place[0], y=place[1])
+    page.ask("goal", what="use")
+    assert page.ask("do", text=f"put the {block} in the {bowl}")["reached"] == {"seen": True, "true": True}
+
+
 def test_a_bowl_is_moved_with_what_lies_in_it(open_page) -> None:
     page = open_page(OCCUPIED)
     names = {one["name"]: one for one in page.scene["things"]}
@@ -204,6 +221,22 @@ def test_a_wrong_wish_gets_a_sentence_and_changes_nothing(open_page, verb, body,
     before = page.scene
     assert said in page.refused(verb, **body)
     assert page.scene == before
+
+
+def test_what_is_no_json_and_no_text_gets_a_sentence(open_page) -> None:
+    page = open_page(OCCUPIED)
+
+    def send(verb: str, body: bytes) -> str:
+        url, kind = f"/api/{page.name}/{verb}", {"Content-Type": "application/json"}
+        answer = page.client.post(url, content=body, headers=kind)
+        assert 400 <= answer.status_code < 500
+        return answer.json()["error"]
+
+    assert all(send("imagine", body) for body in (b"[" * 100_000, b"{", b"\xff"))
+    half = rb'"put the red block \ud800"'  # JSON may hold half a character
+    assert "texts.0: Value error, it holds half a character" in send("imagine", b'{"texts": [%s]}' % half)
+    assert "text: Value error, it holds half a character" in send("do", b'{"text": %s}' % half)
+    assert page.client.get("/api/nowhere").json() == {"error": "Not Found"}
 
 
 def test_a_wrong_link_is_said_and_another_scene_is_shown(open_page) -> None:
@@ -276,6 +309,7 @@ def test_films_can_be_downloaded(open_page, tmp_path: Path) -> None:
     assert ASKED in sent and "red block" in sent
     # Acts that the page shows beside each other are one film, and one page.
     for more in (False, True):
+        page.ask("plan", text=ASKED)  # as the page does before each act of a plan that is carried out
         page.ask("do", text=("put the brown block in the gray bowl", ASKED)[more], more=more)
     film = iio.imread(page.client.get(f"/api/{page.name}/film.gif").content, extension=".gif")
     assert len(film) == 2 * (HORIZON + 1) and film.shape[2] > 3 * 256
@@ -535,6 +569,7 @@ def test_where_it_cannot_listen_it_says_why(capsys) -> None:
             (["--port", str(port)], f"port {port}: Address already in use"),
             (["--port", "70000"], "0 to 65535"),
             (["--host", "no.such.host.invalid"], "no such address"),
+            (["--host", "a..b"], "no such address"),
             (["--most-pages", "0"], "at least 1"),
             (["--port", "0", "--checkpoint", "nothing"], "nothing"),
         ):

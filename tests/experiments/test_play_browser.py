@@ -301,6 +301,16 @@ def test_what_is_dragged_out_of_the_picture_is_taken_away(visit) -> None:
     assert "brown block" not in names(page) and "cyan bowl" in names(page)
 
 
+def test_a_second_click_takes_nothing_else_away(visit) -> None:
+    page = visit()
+    names = page.locator("#things button")
+    before = names.all_inner_texts()
+    names.nth(0).focus()
+    page.locator("#remove").dblclick()
+    expect(page.locator("#message")).to_contain_text("gone already")
+    assert names.all_inner_texts() == before[1:]
+
+
 def test_a_finger_moves_things_and_takes_them_away(visit) -> None:
     page = visit(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
     finger = page.context.new_cdp_session(page)
