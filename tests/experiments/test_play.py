@@ -6,14 +6,21 @@ import base64
 import io
 import json
 import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib.metadata import EntryPoint
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.request import Request as URLRequest
+from urllib.request import urlopen
 
 import gymnasium as gym
 import imageio.v3 as iio
@@ -576,6 +583,35 @@ def test_where_it_cannot_listen_it_says_why(capsys) -> None:
             assert command.main(["--no-browser", *arguments]) == 1
             printed = capsys.readouterr().err
             assert printed.startswith("textocvp: ") and said in printed and "Traceback" not in printed
+
+
+def test_a_server_that_is_stopped_while_it_plans_says_so_and_no_more() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    line = [sys.executable, "-m", "textocvp.cli", "play", "--no-browser", "--port", str(port)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        assert run.stdout is not None
+        while "(Ctrl-C ends it)" not in run.stdout.readline():
+            assert run.poll() is None
+
+        def ask(verb: str, **body: Any) -> Any:
+            data, kind = json.dumps(body).encode(), {"Content-Type": "application/json"}
+            return json.load(urlopen(URLRequest(f"http://127.0.0.1:{port}/api/{verb}", data, kind), timeout=60))
+
+        name = ask("open", query=OCCUPIED)["page"]
+
+        def plan() -> None:
+            with suppress(OSError):  # the server goes away
+                ask(f"{name}/plan", text=ASKED)
+
+        busy = threading.Thread(target=plan)
+        busy.start()
+        time.sleep(0.3)
+        run.send_signal(signal.SIGINT)
+        said = run.stdout.read()
+        busy.join()
+    assert "textocvp: stopped" in said and "Traceback" not in said and "ERROR" not in said
 
 
 def test_the_address_says_who_can_reach_it() -> None:

@@ -424,6 +424,9 @@ def test_a_goal_is_arranged(visit) -> None:
     use.click()
     expect(page.locator("#message")).to_contain_text("press plan")
     assert page.locator("#scene").get_attribute("src") == before
+    page.locator("#seed").fill("abc")  # which is refused, and changes nothing
+    press(page, "show")
+    expect(page.locator("#message")).to_contain_text("must be a whole number")
     press(page, "plan")
     expect(page.get_by_text(f"the {block} in the {bowl}. It is imagined to reach the goal.")).to_be_visible()
 
