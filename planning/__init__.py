@@ -15,6 +15,11 @@ Scoring rollouts without a robot:
 Nothing here reads the simulator's state, except `SegmentationGrounder` and `ground_by_segmentation`.
 """
 
+from collections.abc import Callable
+from functools import partial
+
+from torch import Tensor
+
 from .camera import PinholeCamera, View
 from .controller import Controller, LiteralController, PickAndPlace
 from .grounding import (
@@ -46,12 +51,18 @@ from .search import (
 InstructionPlanner = BeamPlanner
 """What the planner of goals of one instruction was called when it stood alone: programs of users say it."""
 
+
+def Judge(limits: Thresholds = THRESHOLDS) -> Callable[[Trace], Tensor]:
+    """What `succeeds` was when it was a class: programs of users say `Judge()(trace)`."""
+    return partial(succeeds, limits=limits)
+
+
 __all__ = [
     "RELATIONS", "THRESHOLDS", "AnyGoal", "AnySentencePlanner", "AppearanceGrounder", "Attempt", "BeamPlanner",
     "BelievingPlanner", "Candidate", "Controller", "EpisodeResult", "Foresees", "Goal", "Grounder", "Grounding",
-    "GroundingError", "Imagines", "Instruction", "InstructionPlanner", "LiteralController", "LiteralPlanner", "Palette",
-    "PickAndPlace", "PictureGoal", "PinholeCamera", "Plan", "Planner", "RandomPlanner", "Relation", "SearchPlanner",
-    "SegmentationGrounder", "Thing", "Thresholds", "Trace", "View", "Wanted", "ground", "ground_by_segmentation",
-    "measure", "measure_rollout", "observe", "places", "run_episode", "score", "seen_supports", "succeeds", "unmet",
-    "watched_frames",
+    "GroundingError", "Imagines", "Instruction", "InstructionPlanner", "Judge", "LiteralController", "LiteralPlanner",
+    "Palette", "PickAndPlace", "PictureGoal", "PinholeCamera", "Plan", "Planner", "RandomPlanner", "Relation",
+    "SearchPlanner", "SegmentationGrounder", "Thing", "Thresholds", "Trace", "View", "Wanted", "ground",
+    "ground_by_segmentation", "measure", "measure_rollout", "observe", "places", "run_episode", "score",
+    "seen_supports", "succeeds", "unmet", "watched_frames",
 ]  # fmt: skip

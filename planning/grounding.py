@@ -65,6 +65,18 @@ class Palette:
         return cls(colors, unit(palette["robot"]), unit(palette["table"]))
 
 
+TABLETOP = Palette.from_info({
+    "colors": {
+        "blue": (78, 121, 167), "green": (89, 169, 79), "red": (255, 87, 89), "brown": (156, 117, 95),
+        "cyan": (118, 183, 178), "gray": (186, 176, 172), "yellow": (237, 201, 72), "pink": (255, 157, 167),
+        "purple": (176, 122, 161), "white": (255, 255, 255), "orange": (242, 142, 43),
+    },
+    "robot": (105, 72, 240),
+    "table": (47, 47, 47),
+})  # fmt: skip
+"""Of the environments' scene "simple"."""
+
+
 @dataclass(frozen=True)
 class Grounding:
     """Which slots of one scene are what. Slots keep their index, so this holds for all frames of a rollout."""
@@ -89,6 +101,12 @@ class Grounding:
             if thing.color != target.color
         ]
         return tuple(sorted(every))
+
+    def told(self, things: Iterable[Thing]) -> Grounding:
+        """The same where what is seen in the colour of one of these things is that thing, of whatever kind it looks."""
+        kinds = {thing.color: thing.kind for thing in things}
+        seen = {Thing(one.color, kinds.get(one.color, one.kind)): slots for one, slots in self.things.items()}
+        return replace(self, things=seen)
 
     def slots_of(self, thing: Thing) -> tuple[int, ...]:
         """The slots of a thing.
@@ -149,7 +167,7 @@ class SegmentationGrounder:
         return replace(ground_by_segmentation(parsed, self.segmentation, self.objects)[0], view=self.view)
 
 
-def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette) -> list[Grounding]:
+def ground(rollout: Rollout, camera: PinholeCamera, palette: Palette = TABLETOP) -> list[Grounding]:
     """Ground the first frame of every rollout of a batch by appearance: B groundings.
 
     Each slot takes the nearest colour's name, whatever the light. Slots of one name that touch are one object, and no

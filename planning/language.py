@@ -60,6 +60,16 @@ class Instruction:
         """The thing and its target."""
         return self.thing, self.target
 
+    @property
+    def block(self) -> str:
+        """The colour of the thing: what it was called when there were blocks and bowls alone, and users still say."""
+        return self.thing.color
+
+    @property
+    def bowl(self) -> str:
+        """The colour of the target, likewise."""
+        return self.target.color
+
     @classmethod
     def parse(cls, text: str) -> Instruction:
         """The inverse of `text`. Raises as `Goal.parse`, and if the sentence asks for more than one thing."""
