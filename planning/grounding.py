@@ -102,12 +102,6 @@ class Grounding:
         ]
         return tuple(sorted(every))
 
-    def told(self, things: Iterable[Thing]) -> Grounding:
-        """The same where what is seen in the colour of one of these things is that thing, of whatever kind it looks."""
-        kinds = {thing.color: thing.kind for thing in things}
-        seen = {Thing(one.color, kinds.get(one.color, one.kind)): slots for one, slots in self.things.items()}
-        return replace(self, things=seen)
-
     def slots_of(self, thing: Thing) -> tuple[int, ...]:
         """The slots of a thing.
 
@@ -126,6 +120,8 @@ class Grounding:
         seen = self.things.items()
         renamed = {Thing(one.color, kinds.get(one.color, one.kind)): slots for one, slots in seen}
         return replace(self, things=renamed)
+
+    told = with_kinds  # what it was called: programs of users say it
 
 
 class Grounder(Protocol):

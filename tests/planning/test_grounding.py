@@ -6,6 +6,7 @@ from planning import (
     AppearanceGrounder,
     Goal,
     GroundingError,
+    Instruction,
     Palette,
     PinholeCamera,
     SegmentationGrounder,
@@ -14,7 +15,7 @@ from planning import (
     ground_by_segmentation,
     unmet,
 )
-from planning.grounding import color_distance
+from planning.grounding import TABLETOP, color_distance
 from planning.masks import hard_masks
 from tests.planning.conftest import thing
 from tests.planning.oracle import ARM, BACKGROUND, COLORS, PALETTE, PALETTE_INFO, OracleWorldModel
@@ -125,6 +126,17 @@ def test_the_palette_of_info_decides_the_names(oracle: OracleWorldModel, camera:
     others = {name: color for name, color in PALETTE.colors.items() if name != "white"}
     mistaken = Palette(others, robot=PALETTE.colors["white"], table=PALETTE.table)
     assert ground(parsed, camera, mistaken)[0].arm == usual.slots_of(Thing("white", "bowl"))
+
+
+def test_what_programs_of_users_say_still_holds(oracle: OracleWorldModel, camera: PinholeCamera) -> None:
+    """No palette, kinds told after grounding, colours as block and bowl, and a judge."""
+    ask = Instruction.parse("put the red block in the blue bowl")
+    assert (ask.block, ask.bowl) == ("red", "blue")
+    parsed = oracle.parse(BLACK)
+    assert ground(parsed, camera) == ground(parsed, camera, TABLETOP)
+    (grounding,) = ground(parsed, camera, PALETTE)
+    named = [Thing("gray", "block"), Thing("pink", "bowl")]
+    assert grounding.told(named) == grounding.with_kinds(named) != grounding
 
 
 def test_goal_reached_by_sight(objects, camera: PinholeCamera) -> None:

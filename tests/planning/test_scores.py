@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from planning import Thresholds, Trace, measure, measure_rollout, score, succeeds
+from planning import Judge, Thresholds, Trace, measure, measure_rollout, score, succeeds
 from planning.masks import contact_distance
 from planning.relations import RELATIONS
 from planning.scores import carry_score, placement_score
@@ -81,7 +81,7 @@ def test_traces_join_over_steps() -> None:
     joined = trace([9, 1, 1], [9, 9, 9]).then(trace([1, 9, 9], [9, 3, 3]), length=3)
     assert joined.frames == (0, 1, 2, 3, 4, 5)
     assert joined.longest_contact(2).item() == 3
-    assert succeeds(joined, LIMITS).all()
+    assert succeeds(joined, LIMITS).all() and torch.equal(Judge(LIMITS)(joined), succeeds(joined, LIMITS))
 
 
 def test_measure_checks_shapes() -> None:

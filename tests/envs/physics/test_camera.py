@@ -13,6 +13,7 @@ from envs.colors import COLORS, ROBOT_RGB
 from envs.factors import Factors
 from envs.geometry import SPAWN, WORKSPACE, Sizes
 from envs.physics.camera import PRESETS, Camera
+from planning.grounding import TABLETOP, Palette
 
 Make = Callable[..., gym.Env[Any, Any]]
 SIZES = Sizes()
@@ -157,6 +158,7 @@ def test_labels_and_palette_of_the_info_are_what_is_drawn(make: Make) -> None:
         labels = [item["label"] for item in info["objects"]]
         assert set(np.unique(segmentation)) == {0, 1, *labels} and len(set(labels)) == len(labels)
         assert (rgb[segmentation == 0] == palette["table"]).all()
+        assert Palette.from_info(palette) == TABLETOP  # which is meant where a program gives none
         things = [(item["label"], palette["colors"][item["color"]]) for item in info["objects"]]
         seen_at = {}
         for label, color in [*things, (1, palette["robot"])]:
