@@ -56,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"textocvp: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("textocvp: stopped", file=sys.stderr)
+        pass
+    print("textocvp: stopped", file=sys.stderr)
     return 0
 
 
