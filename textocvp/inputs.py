@@ -163,13 +163,12 @@ def warn_of_foreign(
     gray_B = are_gray(values_B3HW) & (not own.gray)
     swapped_B = torch.zeros_like(gray_B)
     if own.hue:
-        hue_3 = values_B3HW.new_tensor(list(bytes.fromhex(own.hue))) / 255
+        hue_3 = from_hex(own.hue, values_B3HW) / 255
         now_B, other_B = hue_shares(values_B3HW, torch.stack([hue_3, hue_3.flip(0)])).unbind(1)
         swapped_B = (other_B >= HUE_SHARE) & (other_B >= 2 * now_B)
     other_B = torch.zeros_like(gray_B)
     if own.canvas:
-        own_3 = values_B3HW.new_tensor(list(bytes.fromhex(own.canvas)))
-        other_B = (values_B3HW.flatten(2).median(-1).values - own_3).abs().amax(1) > OTHER_CANVAS
+        other_B = (canvas(values_B3HW) - from_hex(own.canvas, values_B3HW)).abs().amax(1) > OTHER_CANVAS
     poor_B = psnr_B < own.psnr_low
     for i in (flat_B | gray_B | swapped_B | other_B | poor_B).nonzero()[:, 0].tolist():
         if flat_B[i]:
@@ -194,6 +193,16 @@ def warn_of_foreign(
             stacklevel=depth + 1,
         )
         return
+
+
+def canvas(values_B3HW: Tensor) -> Tensor:
+    """(B, 3) the median colour of pictures."""
+    return values_B3HW.flatten(2).median(-1).values
+
+
+def from_hex(color: str, like: Tensor) -> Tensor:
+    """A colour of `OwnFrames`, RRGGBB, as (3,) numbers of 0..255 where `like` is."""
+    return like.new_tensor(list(bytes.fromhex(color)))
 
 
 def are_gray(values_B3HW: Tensor) -> Tensor:

@@ -126,18 +126,15 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
                 await asyncio.sleep(30)
                 await run_in_threadpool(sessions.sweep)
 
-        async def warm_up() -> None:  # the first film takes a second longer than all others: let nobody wait for it
-            def imagine() -> None:
-                with heard(), suppress(Exception):  # what fails is said to the person whom it fails
-                    session = sessions.make(Link())
-                    try:
-                        session.imagine(session.world.sentences(None)[:1])
-                    finally:
-                        session.close()
+        def warm_up() -> None:  # the first film takes a second longer than all others: let nobody wait for it
+            with heard(), suppress(Exception):  # what fails is said to the person whom it fails
+                session = sessions.make(Link())
+                try:
+                    session.imagine(session.world.sentences(None)[:1])
+                finally:
+                    session.close()
 
-            await run_in_threadpool(imagine)
-
-        aside = [asyncio.create_task(sweep()), asyncio.create_task(warm_up())]
+        aside = [asyncio.create_task(sweep()), asyncio.create_task(run_in_threadpool(warm_up))]
         yield
         for task in aside:
             task.cancel()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -67,7 +67,7 @@ class Tabletop:
     @property
     def supports(self) -> dict[str, str]:
         """What carries each thing, by name: things that were taken away and added again have other numbers."""
-        names = [f"{item['color']} {item['kind']}" for item in self.info["objects"]]
+        names = [str(_thing(item)) for item in self.info["objects"]]
         known = {-1: "table", -2: ""} | dict(enumerate(names))
         return dict(zip(names, (known[carrier] for carrier in self.info["supports"]), strict=True))
 
@@ -86,7 +86,7 @@ class Tabletop:
         camera, colors = self.camera, self.info["palette"]["colors"]
         return [
             {
-                "name": f"{item['color']} {item['kind']}",
+                "name": str(_thing(item)),
                 "color": [int(value) for value in colors[item["color"]]],
                 "at": camera.project(item["position"]).tolist(),
                 "height": float(item["position"][2]),
@@ -97,7 +97,7 @@ class Tabletop:
     def sentences(self, picture: Rollout | None) -> list[str]:
         """Every sentence of one step about what is there, or about what is seen in a person's own picture."""
         if picture is None:
-            named = {Thing(item["color"], item["kind"]): () for item in self.info["objects"]}
+            named = {_thing(item): () for item in self.info["objects"]}
             grounding = Grounding((), (), named)
         else:
             grounding = self.grounder(picture)
@@ -201,6 +201,11 @@ def slot_names(grounding: Grounding) -> dict[int, str]:
     """What grounded slots are called."""
     things = {slot: str(thing) for thing, slots in grounding.things.items() for slot in slots}
     return things | {slot: "arm" for slot in grounding.arm}
+
+
+def _thing(item: Mapping[str, Any]) -> Thing:
+    """What language calls one of `info["objects"]`."""
+    return Thing(item["color"], item["kind"])
 
 
 def _as_item(row: Row) -> dict[str, Any]:

@@ -378,18 +378,18 @@ class EpisodeFile(Episodes):
     def _check_arrays(self, file: h5py.File) -> None:
         """A ValueError where frames and index are not as docs/data.md lays them out."""
         frames, index = file["frames"], file["episode"]
-        lengths, text = index["length"], index["instruction"]
+        lengths, text = index["length"][()], index["instruction"]
         total, wrong = frames.shape[0] if frames.shape else 0, ""
         if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or frames.shape[1] != frames.shape[2]:
             wrong = f"frames must be uint8 (N, H, H, 3), square and RGB, not {frames.dtype} {frames.shape}"
-        elif lengths.dtype.kind not in "iu" or lengths.ndim != 1 or (lengths[:] < 1).any():
+        elif lengths.dtype.kind not in "iu" or lengths.ndim != 1 or (lengths < 1).any():
             wrong = "the lengths of its episodes must be whole numbers (E,), each at least 1"
         elif not len(lengths):
             wrong = "it has no episode"
         elif h5py.check_string_dtype(text.dtype) is None:
             wrong = f"its instructions must be sentences, not {text.dtype}"
-        elif not np.array_equal(index["start"][:], np.cumsum(lengths[:]) - lengths[:]) or total != lengths[:].sum():
-            wrong = f"{total} frames, but its index tells {lengths[:].sum()}, which must stand one after another"
+        elif not np.array_equal(index["start"][:], np.cumsum(lengths) - lengths) or total != lengths.sum():
+            wrong = f"{total} frames, but its index tells {lengths.sum()}, which must stand one after another"
         else:
             shapes = {f"episode/{name}": (len(lengths),) for name in index}
             shapes |= dict.fromkeys(FRAME_ARRAYS, (total,)) | {"segmentation": frames.shape[:3]}

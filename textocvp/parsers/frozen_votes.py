@@ -49,20 +49,19 @@ class VotesEncoder(FrozenEncoder):
         folder = BUNDLED / name if (BUNDLED / name).is_dir() else Path(name)
         try:
             parser = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["parser"]
-            tensors = load_file(folder / WEIGHTS_FILE)
-        except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+            tensors, kind = load_file(folder / WEIGHTS_FILE), parser["kind"]
+            if kind == "votes":
+                network = VoteNetwork(parser["channels"], parser["channels_full"])
+                own = {key: tensors[f"parser.network.{key}"].float().contiguous() for key in network.state_dict()}
+                network.load_state_dict(own)
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError, SafetensorError) as error:
             raise WeightsError(
                 f"{self.part}.encoder_weights: {name!r} is no checkpoint that can be read ({error}); the encoder "
                 "'votes' takes the folder of one whose parser is 'votes', or the name of such a bundled one"
             ) from error
-        if parser.get("kind") != "votes":
-            raise WeightsError(
-                f"{self.part}.encoder_weights: the parser of {name!r} is no 'votes', but {parser['kind']!r}"
-            )
-        channels, full = parser["channels"], parser["channels_full"]
+        if kind != "votes":
+            raise WeightsError(f"{self.part}.encoder_weights: the parser of {name!r} is no 'votes', but {kind!r}")
         self._check_sizes(WIDTH, STRIDE, str(folder))
-        network = VoteNetwork([channels * times for times in (1, 2, 3, 4)], full)
-        own = {key: tensors[f"parser.network.{key}"].float().contiguous() for key in network.state_dict()}
         # Of this network alone: another predictor beside it is the same encoder.
         digest = sha256(b"".join(own[key].numpy().tobytes() for key in sorted(own))).hexdigest()
         if self.fingerprint not in ("", digest):
@@ -70,7 +69,6 @@ class VotesEncoder(FrozenEncoder):
                 f"{self.part}.encoder_fingerprint: this was made with another voting network ({self.fingerprint[:12]}) "
                 f"than that of {folder} ({digest[:12]}); give its checkpoint in {self.part}.encoder_weights"
             )
-        network.load_state_dict(own)
         return network, digest
 
     def _encode(self, backbone: nn.Module, frames_N3HW: Tensor) -> Tensor:

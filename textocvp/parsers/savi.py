@@ -158,9 +158,8 @@ class SlotAttention(nn.Module):
         self.key = nn.Linear(slot_dim, slot_dim, bias=False)
         self.value = nn.Linear(slot_dim, slot_dim, bias=False)
         for layer in (self.query, self.key, self.value):
-            nn.init.xavier_uniform_(
-                layer.weight
-            )  # as published; PyTorch's own is a third of it: slots stay alike longer
+            # As published. PyTorch's own start is a third of it, and slots stay alike far longer.
+            nn.init.xavier_uniform_(layer.weight)
         self.gru = nn.GRUCell(slot_dim, slot_dim)
         self.mlp = nn.Sequential(nn.Linear(slot_dim, hidden), nn.ReLU(), nn.Linear(hidden, slot_dim))
 

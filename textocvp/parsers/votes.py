@@ -82,18 +82,19 @@ class VoteNetwork(nn.Module):
     Most of it works at half resolution and below; two thin convolutions at full resolution draw the borders.
 
     Args:
-        channels: at half, quarter, ... resolution.
+        channels: at half resolution; at the three below it twice, three and four times as many.
         full: channels at full resolution.
     """
 
-    def __init__(self, channels: list[int], full: int) -> None:
+    def __init__(self, channels: int, full: int) -> None:
         super().__init__()
+        widths = [channels * times for times in (1, 2, 3, 4)]
         self.fine = nn.Conv2d(3, full, 3, padding=1)
-        self.stem = nn.Conv2d(12, channels[0], 3, padding=1)
-        pairs = list(zip(channels[:1] + channels[:-1], channels, strict=True))
+        self.stem = nn.Conv2d(12, channels, 3, padding=1)
+        pairs = list(zip(widths[:1] + widths[:-1], widths, strict=True))
         self.down = nn.ModuleList([Residual(a, b) for a, b in pairs])
         self.up = nn.ModuleList([Residual(a + b, a) for a, b in pairs[:0:-1]])
-        self.widen = nn.Conv2d(channels[0], 4 * full, 3, padding=1)
+        self.widen = nn.Conv2d(channels, 4 * full, 3, padding=1)
         self.border = nn.Conv2d(2 * full, full, 3, padding=1)
         self.out = nn.Conv2d(full, 6, 3, padding=1)
         for layer in (self.fine, self.stem, self.widen, self.border):
@@ -280,8 +281,7 @@ class VotesParser(SceneParser):
 
     def __init__(self, config: VotesConfig) -> None:
         super().__init__(config)
-        channels = [config.channels * times for times in (1, 2, 3, 4)]
-        self.network = VoteNetwork(channels, config.channels_full)
+        self.network = VoteNetwork(config.channels, config.channels_full)
         self.corrector = PlacedCorrector(config)
 
     def forward(self, frames_BT3HW: Tensor, *, num_slots: int | None = None, generator: Generators = None) -> Parsed:

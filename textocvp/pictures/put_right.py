@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from textocvp.inputs import OwnFrames
+from textocvp.inputs import OwnFrames, canvas, from_hex
 
 SAME_LIGHT = 0.1  # by what share the canvas may be brighter or darker: then nothing is put right
 MOST_LIGHT = 3.0  # times; what is farther off is another scene
@@ -16,11 +16,6 @@ MORE_GRAIN = 0.2  # share of the neighbours, beyond that of the model's own pict
 REACH, SPREAD = 8, 5.0  # pixels
 LUMA, CHROMA = 10.0, 30.0  # of 0..255, standard deviations: what is farther off is another surface
 WEIGHTS = (0.299, 0.587, 0.114)  # luma of RGB (ITU-R BT.601)
-
-
-def canvas(values_B3HW: Tensor) -> Tensor:
-    """(B, 3) the median colour of pictures."""
-    return values_B3HW.flatten(2).median(-1).values
 
 
 def grain(values_B3HW: Tensor) -> Tensor:
@@ -38,7 +33,7 @@ def put_right(frames_BT3HW: Tensor, own: OwnFrames) -> tuple[Tensor, list[str]]:
     if not own.canvas:
         return frames_BT3HW, []
     values_BT3HW = (frames_BT3HW + 1) * 127.5
-    own_3 = values_BT3HW.new_tensor(list(bytes.fromhex(own.canvas)))
+    own_3 = from_hex(own.canvas, values_BT3HW)
     grainy_B = _gain(values_BT3HW, own_3).isfinite() & (grain(values_BT3HW[:, 0]) > own.grain + MORE_GRAIN)
     if grainy_B.any():  # first, for the median of a grainy picture is not that of its canvas
         values_BT3HW = values_BT3HW.clone()

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from textocvp.data.episodes import Episodes
-from textocvp.inputs import DARK, HUE_REACH, HUE_SHARE, LEARNT_DB, OwnFrames, are_gray, hue_shares
+from textocvp.inputs import DARK, HUE_REACH, HUE_SHARE, LEARNT_DB, OwnFrames, are_gray, canvas, hue_shares
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
 from textocvp.metrics.masks import MIN_PIXELS
 from textocvp.model import TextOCVP
 from textocvp.parsers.base import to_frames
-from textocvp.pictures.put_right import canvas, grain
+from textocvp.pictures.put_right import grain
 from textocvp.training.run import Metrics
 
 THRESHOLDS = {"object_miou": 0.80, "object_found": 0.93, "followed": 0.90, "psnr": LEARNT_DB}

@@ -141,6 +141,7 @@ def test_slots_may_begin_with_what_is_elected() -> None:
     [
         (lambda folder: (folder / "model.safetensors").write_bytes(b"{}"), "no checkpoint that can be read"),
         (lambda folder: (folder / "config.json").unlink(), "no checkpoint that can be read"),
+        (lambda folder: drop_tensor(folder), "no checkpoint that can be read"),
         (lambda folder: set_kind(folder, "placed"), "the parser of .* is no 'votes', but 'placed'"),
     ],
 )
@@ -161,3 +162,9 @@ def set_kind(folder: Path, kind: str) -> None:
     config = json.loads((folder / "config.json").read_text())
     config["parser"]["kind"] = kind
     (folder / "config.json").write_text(json.dumps(config))
+
+
+def drop_tensor(folder: Path) -> None:
+    tensors = load_file(folder / "model.safetensors")
+    tensors.pop(next(name for name in tensors if name.startswith("parser.network.")))
+    save_file(tensors, folder / "model.safetensors")
