@@ -22,13 +22,15 @@ Labels = NDArray[np.uint8]
 TONE_SHARE = 0.06  # of the picture: a colour as common as this is background
 TONE_RADIUS = 4  # of 255, in each channel: clean videos have flat floors
 MIXED = 0.35  # share of a thing in the colour of a pixel up to which the pixel is background
+NOISE = 8.0  # of 255, in each channel: what such a pixel may differ from a mixture of the two
 GRAY = 26  # of 255: difference between channels up to which a pixel is gray
 SAME_HUE = 0.035  # difference of chroma between neighbours up to which they are one thing
 MIN_PIXELS = 4
 FLAT = 0.6  # share of the picture that the commonest colours must have
 # Of a floor in uneven light: what differs more from it in colour, in 0..255, or is this much darker or lighter.
 FLOOR_CHROMA, DARKER, LIGHTER = 14.0, 0.66, 1.06
-FLOOR_HUE = 0.07  # as SAME_HUE
+# As SAME_HUE, MIXED and NOISE. Things are round and shaded, and what is next to a pixel is not quite what is in it.
+FLOOR_HUE, FLOOR_MIXED, FLOOR_NOISE = 0.07, 0.5, 30.0
 FLOOR_ORDER = 4  # of the polynomial that the floor's light is
 
 
@@ -134,6 +136,8 @@ def _masks_on_floor(frame_HW3: NDArray[np.float32], floor_HW: NDArray[np.float32
     share_HW = frame_HW3.mean(-1) / floor_HW.clip(1)
     colored_HW = np.ptp(frame_HW3, axis=-1) > FLOOR_CHROMA
     solid = ndimage.binary_fill_holes(colored_HW | (share_HW < DARKER) | (share_HW > LIGHTER))
+    floor_HW3 = np.broadcast_to(floor_HW[..., None], frame_HW3.shape)
+    solid &= ~(_border(solid) & _mostly(floor_HW3, frame_HW3, FLOOR_MIXED, FLOOR_NOISE))
     return _numbered(_parts_of_one_hue(frame_HW3, solid, FLOOR_HUE), np.zeros(solid.shape, np.uint8))
 
 
@@ -147,8 +151,7 @@ def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) 
     apart_HWK = np.abs(frame_HW3[:, :, None] - tones_K3).max(-1)
     # Where floor and table meet there is a line of mixed colours, one or two pixels thick.
     solid = ndimage.binary_opening(apart_HWK.min(-1) > TONE_RADIUS, np.ones((2, 2)))
-    border = solid & ~ndimage.binary_erosion(solid, border_value=1)
-    solid &= ~(border & _mostly(tones_K3[apart_HWK.argmin(-1)], frame_HW3))
+    solid &= ~(_border(solid) & _mostly(tones_K3[apart_HWK.argmin(-1)], frame_HW3, MIXED, NOISE))
     labels = np.zeros(solid.shape, np.uint8)
     gray = solid & (np.ptp(frame_HW3, axis=-1) <= GRAY)
     parts, _ = ndimage.label(gray)
@@ -157,8 +160,14 @@ def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) 
     return _numbered(_parts_of_one_hue(frame_HW3, solid & (labels == 0)), labels)
 
 
-def _mostly(tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which pixels (H, W) are their tone with less than `MIXED` of a neighbour's colour in it."""
+def _border(solid_HW: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return solid_HW & ~ndimage.binary_erosion(solid_HW, border_value=1)
+
+
+def _mostly(
+    tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32], mixed: float, noise: float
+) -> NDArray[np.bool_]:
+    """Which pixels (H, W) are their tone with less than `mixed` of a neighbour's colour in it."""
     H, W, _ = frame_HW3.shape
     around = np.pad(frame_HW3, ((1, 1), (1, 1), (0, 0)), "edge")
     own_HW3, mostly_HW = frame_HW3 - tone_HW3, np.zeros((H, W), bool)
@@ -166,7 +175,7 @@ def _mostly(tone_HW3: NDArray[np.float32], frame_HW3: NDArray[np.float32]) -> ND
         other_HW3 = around[dy : dy + H, dx : dx + W] - tone_HW3
         share_HW = (own_HW3 * other_HW3).sum(-1) / np.square(other_HW3).sum(-1).clip(1)
         rest_HW = np.abs(own_HW3 - share_HW[..., None] * other_HW3).max(-1)
-        mostly_HW |= (share_HW > 0) & (share_HW < MIXED) & (rest_HW <= 2 * TONE_RADIUS)
+        mostly_HW |= (share_HW > 0) & (share_HW < mixed) & (rest_HW <= noise)
     return mostly_HW
 
 

@@ -152,3 +152,17 @@ def test_on_a_floor_in_uneven_light_shadows_are_floor_and_gray_things_are_not() 
     for mine, truth in zip(found, labels, strict=True):
         assert [len(np.unique(mine[truth == label])) for label in (1, 2)] == [1, 1]
         assert len(np.unique(mine)) == 3 and not (mine == 1).any()  # no robot
+
+
+@pytest.mark.parametrize(("share", "is_thing"), [(0.4, False), (0.6, True)])
+def test_an_edge_on_an_uneven_floor_is_the_thing_where_it_is_mostly_the_thing(share: float, is_thing: bool) -> None:
+    y, x = np.mgrid[-1:1:48j, -1:1:48j]
+    frames = np.repeat((165 * (1 - 0.1 * (x**2 + y**2)))[None, ..., None], 3, 3).repeat(3, 0)
+    edge, inside = np.zeros((48, 48), bool), np.zeros((48, 48), bool)
+    edge[19:29, 19:29], inside[20:28, 20:28] = True, True
+    frames[:, inside] = (190, 40, 40)
+    edge &= ~inside
+    frames[:, edge] += share * (np.array((190, 40, 40)) - frames[:, edge])
+    frames = frames.round().astype(np.uint8)
+    found = video_masks(frames, backdrop(frames))
+    assert np.array_equal(found[0] > 0, inside | edge if is_thing else inside)
