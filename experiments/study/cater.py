@@ -1,6 +1,6 @@
 """What CATER's scenes are for a study, and how an imagined clip is judged: from masks, by the simulator's rules."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
@@ -73,13 +73,16 @@ def slots_of_things(rollout: Rollout, first_HW: np.ndarray) -> dict[int, int]:
 
 @dataclass(frozen=True)
 class Judged:
-    """One action as it was imagined; None where the truth says nothing of it."""
+    """One action as it was imagined; None where nothing can be said of it."""
 
-    action: Action
     object: bool | None  # the named thing is among those that move farthest
-    did: bool  # what it does is what the caption says
+    action: bool | None  # what it does is what the caption says
     place: bool | None  # it ends in the named cell or next to it
-    hidden: bool | None  # what is contained vanishes
+    vanishes: bool | None  # what is contained is no longer seen
+
+    def where(self, true: "Judged") -> "Judged":
+        """Only what the simulator's own masks show: a thing that it moves by two pixels does not move in pictures."""
+        return Judged(*(getattr(self, one.name) if getattr(true, one.name) else None for one in fields(self)))
 
 
 def judge(labels_THW: np.ndarray, clip: Clip, first_HW: np.ndarray) -> list[Judged]:
@@ -104,7 +107,6 @@ def judge(labels_THW: np.ndarray, clip: Clip, first_HW: np.ndarray) -> list[Judg
             place = way is not None and _next_to(_place(way, clip.things[who], size), act.to)
         found.append(
             Judged(
-                act.action,
                 None if act.to is None else who in farthest and far[who] > MOVED,
                 did == act.action,
                 place,
