@@ -32,18 +32,20 @@ DONE = "done"
 SLOTS = {"slots-train": "train.h5", "slots-val": "val.h5"}  # as `textocvp train predictor` names them
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scale:
-    """How much is made: clips, and the updates of each step with their batch."""
+    """How much is made: clips, and the updates of each step with their batch; steps of no updates are left out."""
 
     train: int
     val: int
+    seen: int  # the first clips, from which the voting parsers learn
     votes: tuple[int, int]
     draw: tuple[int, int]
     predictor: tuple[int, int]
-    outcome: tuple[int, int]
-    savi: tuple[int, int]
-    savi_clips: tuple[int, int]
+    polish: tuple[int, int]
+    savi: str  # preset of published slot attention
+    stills: tuple[int, int]
+    clips: tuple[int, int]
     savi_predictor: tuple[int, int]
     vqvae: tuple[int, int]
     mage: tuple[int, int]
@@ -51,15 +53,26 @@ class Scale:
 
 
 SCALES = {
-    "toy": Scale(60, 16, (4, 4), (4, 4), (6, 4), (4, 4), (4, 2), (2, 2), (2, 2), (4, 2), (2, 2), 2),
+    "toy": Scale(
+        train=60, val=16, seen=40, votes=(4, 4), draw=(4, 4), predictor=(6, 4), polish=(2, 4),
+        savi="savi-cater", stills=(4, 2), clips=(2, 2), savi_predictor=(2, 2), vqvae=(4, 2), mage=(2, 2), evaluate=2,
+    ),
     "cpu": Scale(
-        2000, 120, (3000, 16), (1500, 16), (4000, 32), (3000, 64), (6000, 32), (400, 8), (800, 8), (1600, 16),
-        (1000, 8),
+        train=12000, val=100, seen=3200, votes=(2000, 16), draw=(1200, 16), predictor=(10500, 16),
+        polish=(6000, 16), savi="savi-small", stills=(9500, 16), clips=(0, 0), savi_predictor=(1500, 16),
+        vqvae=(1600, 16), mage=(1000, 8),
     ),
     "gpu": Scale(
-        5000, 120, (3000, 32), (1500, 16), (4000, 64), (3000, 128), (6000, 64), (1000, 24), (1500, 32),
-        (3000, 32), (2000, 32), 60,
+        train=5000, val=120, seen=5000, votes=(3000, 32), draw=(1500, 16), predictor=(4000, 64),
+        polish=(0, 0), savi="savi-cater", stills=(6000, 64), clips=(1000, 24), savi_predictor=(1500, 32),
+        vqvae=(3000, 32), mage=(2000, 32), evaluate=60,
     ),
+}  # fmt: skip
+# Ten slots from one Gaussian, as published; the small ones with a wider decoder, and without its Gaussian prior.
+SAVI = {
+    "savi-cater": ("parser.num_slots=10",),
+    "savi-small": ("parser.num_slots=10", "parser.initializer=gaussian", "renderer.hidden=96", "renderer.layers=3",
+                   "renderer.mask_prior=false"),
 }  # fmt: skip
 
 
@@ -94,6 +107,7 @@ class Step:
     name: str
     command: tuple[str, ...]
     done: Path  # what is there when it has run
+    updates: int | None = None  # of a training
     needs: tuple[str, ...] = ()
     slots: Path | None = None  # where the slots of all clips are, for a run that learns from them
 
@@ -118,6 +132,7 @@ def steps(args: Args) -> list[Step]:
             name,
             (*command, *sizes, *few, *options),
             out / name / "checkpoint",
+            size[0],
             ("train", "val", *needs.split()),
             out / linked[0] if linked else None,
         )
@@ -125,40 +140,49 @@ def steps(args: Args) -> list[Step]:
     def slots(name: str, parser: str) -> Step:
         checkpoint = f"{out}/{parser}/checkpoint"
         command = (sys.executable, __file__, "--parse", checkpoint, str(out / name), "--workers", str(args.workers))
-        return Step(name, (*command, "--out", str(out)), out / name / DONE, ("train", "val", parser))
+        return Step(name, (*command, "--out", str(out)), out / name / DONE, needs=("train", "val", parser))
 
     reads = ("--workers", {"toy": "0", "cpu": "1", "gpu": "4"}[args.scale])
-    taught = ("--preset", "cater", "--clip", "1", "--learning-rate", "2e-3", "--warmup", "50", *reads)
+    seen = ("--episodes", str(scale.seen), *reads)
+    taught = ("--preset", "cater", "--clip", "1", "--learning-rate", "2e-3", "--warmup", "50", *seen)
     never = ("--first-redraw", str(scale.votes[0]))
-    savi = ("--preset", "savi-cater", "--set", "parser.num_slots=10", *reads)
+    savi = ("--preset", scale.savi, "--set", *SAVI[scale.savi], *reads)
     fast = ("--precision", "bf16") if args.scale == "gpu" else ()
-    films = ("--autoregressive", "0.6", "--learning-rate", "1e-3")
+    films = ("--learning-rate", "1e-3", "--autoregressive", "0.33", "--horizon", "8")
     cater = ("--parser", f"{out}/draw/checkpoint", *films)
+    words = ("--words-first", str(scale.predictor[0] * 8 // 21))
     plain = ("predictor.appearance=false", "text.kind=transformer")
     color = ("predictor.appearance=false", "predictor.color_bias=true", "text.kind=lexicon")
-    return [
+    savi_parser = "savi-clips" if scale.clips[0] else "savi-stills"
+    savi_text = ("--set", "text.kind=transformer", "predictor.window=29")
+    found = [
         collect("train", scale.train),
         collect("val", scale.val),
         train("votes", "parser", "", scale.votes, *taught, *never),
+        train("draw-videos", "parser", "votes", scale.draw, *taught, "--taught", f"{out}/votes/checkpoint"),
         train("votes-masks", "parser", "", scale.votes, *taught, *never, "--teacher", "masks"),
         train("draw", "parser", "votes-masks", scale.draw, *taught, "--taught", f"{out}/votes-masks/checkpoint"),
         slots("slots", "draw"),
-        train("predictor", "predictor", "slots", scale.predictor, *cater),
+        train("predictor", "predictor", "slots", scale.predictor, *cater, *words),
+        train("polish", "predictor", "predictor slots", scale.polish, "--finetune", "--parser",
+              f"{out}/predictor/checkpoint", "--learning-rate", "7e-4", "--autoregressive", "0.6", "--horizon", "12"),
         train("predictor-plain", "predictor", "slots", scale.predictor, *cater, "--set", *plain),
         train("predictor-color", "predictor", "slots", scale.predictor, *cater, "--set", *color),
         train("ocvp-seq", "predictor", "slots", scale.predictor, *cater, "--preset", "ocvp-seq-small", "--set",
               "predictor.window=29"),
         # Single frames first: slots bind to things before they follow them.
-        train("savi-stills", "parser", "", scale.savi, *savi, *fast, "--clip", "1", "--learning-rate", "4e-4"),
-        train("savi-parser", "parser", "savi-stills", scale.savi_clips, *savi, *fast, "--clip", "6", "--stride", "2",
+        train("savi-stills", "parser", "", scale.stills, *savi, *fast, "--clip", "1", "--learning-rate", "4e-4"),
+        train("savi-clips", "parser", "savi-stills", scale.clips, *savi, *fast, "--clip", "6", "--stride", "2",
               "--start", f"{out}/savi-stills/checkpoint", "--learning-rate", "2e-4"),
-        slots("savi-slots", "savi-parser"),
-        train("savi-cater", "predictor", "savi-slots", scale.savi_predictor, "--parser",
-              f"{out}/savi-parser/checkpoint", "--preset", "savi-cater", "--learning-rate", "2e-4", *fast),
+        slots("savi-slots", savi_parser),
+        train("savi", "predictor", "savi-slots", scale.savi_predictor, "--parser", f"{out}/{savi_parser}/checkpoint",
+              *(("--preset", scale.savi) if scale.savi == "savi-cater" else savi_text), "--learning-rate",
+              "2e-4" if scale.savi == "savi-cater" else "1e-3", *fast),
         train("vqvae", "vqvae", "", scale.vqvae),
         train("mage", "mage", "vqvae", scale.mage, "--vqvae", f"{out}/vqvae/checkpoint", "--autoregressive", "0.8",
               "--changed-weight", "1"),
     ]  # fmt: skip
+    return [step for step in found if step.updates != 0]
 
 
 def main(args: Args) -> int:

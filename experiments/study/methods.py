@@ -142,7 +142,7 @@ METHODS: dict[str, Method] = {
         Method(key="ours, privileged", kind="ceiling", hue=3, plan=_best, privileged=True,
                note="the same, but slots are named by the simulator's segmentation"),
         Method(key="savi", hue=7, note="published slot attention from pixels, and text", model="savi-cater-trained",
-               train="python experiments/train_cater.py --only savi-cater"),
+               train="python experiments/train_cater.py --only savi"),
         Method(key="OCVP-Seq", kind="baseline", hue=5, note="slots, but no text", model="ocvp-seq-small",
                train=f"{_TRAIN_PREDICTOR} --preset ocvp-seq-small {_DATA} --out runs/ocvp-seq --steps 1500 "
                "--autoregressive 1.0"),

@@ -142,6 +142,7 @@ def test_training_is_commands_in_an_order_in_which_they_can_run(tmp_path, capsys
         "slots",
         "predictor",
     ]
+    assert "polish" in {step.name for step in found} > {step.name for step in steps(replace(args, scale="gpu"))}
     with pytest.raises(ValueError, match="there is no step 'nothing'"):
         wanted(found, ["nothing"])
     assert main(replace(args, list=True, only=("val",))) == 0
