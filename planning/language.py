@@ -157,12 +157,12 @@ def _parse(text: str) -> tuple[Instruction, ...]:
                 break
         else:
             raise ValueError(
-                f"cannot read {words!r} in the goal {text!r}; it takes {_forms()}, several joined by 'and'"
+                f"cannot read {words!r} in {text!r}; it takes {_forms()}, several joined by 'and'"
             )
     from matplotlib.colors import is_color_like  # takes longer to import than all of the planner
 
     for thing in (thing for one in found for thing in one.things):
         # Names of CSS, and of the XKCD survey.
         if not (is_color_like(thing.color) or is_color_like(f"xkcd:{thing.color}")):
-            raise ValueError(f"{thing.color!r} in the goal {text!r} is no colour; it takes {_forms()}")
+            raise ValueError(f"{thing.color!r} in {text!r} is no colour; it takes {_forms()}")
     return tuple(found)

@@ -180,6 +180,7 @@ class SearchPlanner:
     depth: int = 4  # sentences of a plan at most
     checked: int = 12  # plans of which films are imagined at most; 0 trusts the search alone
     seed: int = 0  # of the slot sampling
+    relations: Sequence[str] = ()  # that may be said; by default all
 
     def __post_init__(self) -> None:
         for name in ("budget", "depth"):
@@ -190,7 +191,7 @@ class SearchPlanner:
         """The best sequence; see `Planner.plan`. Its rollouts have two frames each: before a sentence, and after."""
         began = perf_counter()
         parsed, grounding, wanted = self.look(rgb, goal, grounder)
-        things, sentences = sorted(grounding.things), grounding.instructions()
+        things, sentences = sorted(grounding.things), grounding.instructions(*self.relations)
         if isinstance(goal, Goal):  # its own sentences first: of equally good plans the obvious one
             sentences = tuple(sorted(sentences, key=lambda one: one not in goal.instructions))
         if not sentences:

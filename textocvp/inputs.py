@@ -247,7 +247,7 @@ def checked_texts(text: str | Sequence[str], encoder: TextEncoder, *, depth: int
         if not isinstance(sentence, str):
             raise TypeError(f"a text must be a string, not {type(sentence).__name__}")
         if not sentence.strip():
-            raise ValueError("an empty text; write what is to be done: 'put the red block in the blue bowl'")
+            raise ValueError("an empty text: write what is to happen")
         if denied := encoder.negations(sentence):
             raise ValueError(
                 f"{sentence!r} says {denied[0]!r}, which this model has never met: it would imagine what is not to "

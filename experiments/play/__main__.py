@@ -6,6 +6,8 @@ import asyncio
 import gc
 import ipaddress
 import logging
+import os
+import signal
 import socket
 import sys
 import threading
@@ -18,6 +20,9 @@ import tyro
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
+    from uvicorn import Server
+
+GRACE = 2.0  # seconds in which answers that are under way may still be given when the server is stopped
 
 
 class Mistake(Exception):
@@ -50,6 +55,7 @@ class PlayCommand:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve the page until Ctrl-C; the exit status."""
     command = tyro.cli(PlayCommand, prog="textocvp play", args=arguments)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     try:
         serve(command)
     except Mistake as error:
@@ -57,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
     print("textocvp: stopped", file=sys.stderr)
     return 0
 
@@ -88,9 +96,25 @@ def serve(command: PlayCommand) -> None:
         threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
     import uvicorn
 
-    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
+    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=int(GRACE))
     logging.getLogger("uvicorn.error").addFilter(_is_news)
-    uvicorn.Server(config).run(sockets=[listening])
+    server = uvicorn.Server(config)
+    ended = threading.Event()
+    threading.Thread(target=_end_in_time, args=(server, ended), daemon=True).start()
+    try:
+        server.run(sockets=[listening])
+    finally:
+        ended.set()
+
+
+def _end_in_time(server: Server, ended: threading.Event) -> None:
+    """Nothing ends a long imagination in its thread, and nobody waits for it once the server is stopped."""
+    while not server.should_exit:
+        if ended.wait(0.2):
+            return
+    if not ended.wait(2 * GRACE):
+        print("textocvp: stopped", file=sys.stderr, flush=True)
+        os._exit(0)
 
 
 def _is_news(record: logging.LogRecord) -> bool:
@@ -120,6 +144,14 @@ def load(command: PlayCommand) -> FastAPI:
         world_model = WorldModel.from_pretrained(command.checkpoint or choice.checkpoint)
     except CheckpointError as error:
         raise Mistake(str(error)) from None
+    name, model = command.checkpoint or choice.checkpoint, world_model.model
+    if model.config.parser.num_slots == 1 or not model.predictor.uses_text:
+        lacks = "slots of things" if model.predictor.uses_text else "sentences"
+        raise Mistake(f"--checkpoint {name}: this model knows no {lacks}, and there is nothing to play with")
+    others = [one.name for one in WORLDS.values() if one.checkpoint == name]
+    if others and command.world not in others:
+        said = f"{name} was trained on another world ({' or '.join(others)}): what it imagines here may mean nothing"
+        print(f"textocvp: {said}", file=sys.stderr, flush=True)
     return create_app(world_model, choice, command.most_pages)
 
 

@@ -33,7 +33,7 @@ class Link:
     @classmethod
     def parse(cls, query: str) -> Link:
         """The inverse of `query`; what else the link says is left alone. Refused for what is no link."""
-        said = dict(parse_qsl(query.removeprefix("?")))
+        said = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True))
         try:
             items = [item.split(",") for item in said.get("layout", "").split(";") if item]
             layout = tuple((kind, color, *map(float, rest)) for kind, color, *rest in items)

@@ -14,12 +14,13 @@ from importlib.resources import files
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import parse_qsl
 
 from fastapi import Body, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 from starlette.exceptions import HTTPException
 
 from envs.colors import COLORS
@@ -30,6 +31,7 @@ from planning import GroundingError
 from textocvp import WorldModel
 from textocvp.film_page import with_films
 
+LONGEST_TEXT = 600  # characters of a sentence, and of what is answered to a wrong one
 LARGEST_PICTURE = 20 * 2**20  # bytes of an upload
 IDLE_SECONDS = 300.0  # a page says something every minute; one that is silent for longer is closed
 # Nothing of another host is ever asked for.
@@ -48,6 +50,7 @@ def _as_text(said: str) -> str:
 
 Text = Annotated[str, AfterValidator(_as_text)]
 Said = Annotated[Text, Body(embed=True)]
+Sentence = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_as_text)]
 Number = Annotated[float, Body(embed=True)]
 
 
@@ -72,7 +75,7 @@ class Sessions:
         name = secrets.token_urlsafe(12)
         with self.lock:
             if len(self.heard_of) >= self.most:
-                raise Refused(f"{self.most} pages are open, and no more may be (--most-pages {self.most}); close one")
+                raise Refused(f"no more pages may be open than {self.most} (--most-pages {self.most}); close one")
             self.heard_of[name] = inf  # which keeps its place
         try:
             session = self.make(link)
@@ -91,14 +94,16 @@ class Sessions:
             self.heard_of[name] = time.monotonic()
             return session
 
-    def close(self, name: str) -> None:
-        """A page is gone; what it is waiting for comes to its end first."""
+    def close(self, name: str, wait: float = -1) -> None:
+        """A page is gone; what it is waiting for comes to its end first, or is left after so many seconds."""
         with self.lock:
             session = self.open.pop(name, None)
             self.heard_of.pop(name, None)
-        if session is not None:
-            with session.lock:
+        if session is not None and session.lock.acquire(timeout=wait):
+            try:
                 session.close()
+            finally:
+                session.lock.release()
 
     def sweep(self) -> None:
         """Close what has been silent for too long."""
@@ -141,7 +146,7 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
             with suppress(asyncio.CancelledError):
                 await task
         for name in list(sessions.open):
-            sessions.close(name)
+            sessions.close(name, wait=1)
 
     app = FastAPI(title="textocvp play", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.sessions = sessions
@@ -156,8 +161,8 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
 
     def sentence(status: int) -> Callable[[Request, Exception], Response]:
         def handle(_: Request, error: Exception) -> Response:
-            said = error.args[0] if error.args else type(error).__name__
-            return JSONResponse({"error": str(said)}, status)
+            said = str(error.args[0] if error.args else type(error).__name__)
+            return JSONResponse({"error": said if len(said) <= LONGEST_TEXT else said[:LONGEST_TEXT] + "…"}, status)
 
         return handle
 
@@ -195,6 +200,9 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
     def open_page(query: Said = "") -> dict[str, Any]:
         problem = []
         try:
+            world = dict(parse_qsl(query.removeprefix("?"))).get("world", choice.name)
+            if world != choice.name:
+                raise Refused(f"this link is of the world {world!r}, and here is {choice.name!r} (--world)")
             name, session = sessions.add(Link.parse(query))
         except (Refused, ValueError) as error:
             name, session = sessions.add(Link())  # says the same once more if there are too many pages
@@ -229,11 +237,11 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
         return ask(name, lambda session: session.table.add(kind, color))
 
     @app.post("/api/{name}/imagine")
-    def imagine(name: str, texts: Annotated[list[Text], Body(embed=True)]) -> dict[str, Any]:
+    def imagine(name: str, texts: Annotated[list[Sentence], Body(embed=True)]) -> dict[str, Any]:
         return ask(name, lambda session: {"films": session.imagine(texts)}, view=False)
 
     @app.post("/api/{name}/do")
-    def do(name: str, text: Said, more: Annotated[bool, Body()] = False) -> dict[str, Any]:
+    def do(name: str, text: Annotated[Sentence, Body()], more: Annotated[bool, Body()] = False) -> dict[str, Any]:
         return ask(name, lambda session: session.do(text, more))
 
     @app.post("/api/{name}/goal")
@@ -241,7 +249,7 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
         return ask(name, lambda session: session.arrange_goal(what))
 
     @app.post("/api/{name}/plan")
-    def plan(name: str, text: Said = "") -> dict[str, Any]:
+    def plan(name: str, text: Annotated[Sentence, Body(embed=True)] = "") -> dict[str, Any]:
         return ask(name, lambda session: session.plan(text), view=False)
 
     @app.post("/api/{name}/picture")

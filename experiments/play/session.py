@@ -68,7 +68,7 @@ class Session:
     """
 
     def __init__(self, world_model: WorldModel, choice: Choice, link: Link, horizon: int | None = None) -> None:
-        self.world_model = world_model
+        self.world_model, self.choice = world_model, choice
         self.lock = threading.Lock()
         self.world = choice.make(world_model.image_size[0])
         horizon = horizon or self.world.horizon
@@ -113,7 +113,7 @@ class Session:
             "picture": picture_url(self.seen),
             "size": [self.seen.shape[1], self.seen.shape[0]],
             "own_picture": own,
-            "link": link.query(),
+            "link": f"world={self.choice.name}&{link.query()}",
             "seed": str(link.seed),
             "family": link.family,
             "task": self.world.task,
@@ -245,10 +245,11 @@ class Session:
 
     def _planner(self, goal: Goal | PictureGoal) -> SearchPlanner:
         model = foresight(self.world_model)
+        relations = self.table.relations
         if self.world_model.foresees:
-            return SearchPlanner(model)
+            return SearchPlanner(model, relations=relations)
         # Whole films take long, so only plans as short as the goal allows.
-        return SearchPlanner(model, budget=FILMS, depth=goal.steps)
+        return SearchPlanner(model, budget=FILMS, depth=goal.steps, relations=relations)
 
     def plan(self, text: str) -> dict[str, Any]:
         """Search for the goal of a sentence, or for the one that was arranged where there is no sentence."""
@@ -263,6 +264,9 @@ class Session:
         if state["reached"]["seen"]:
             return {"done": True, **state}
         plan = self._planner(goal).plan(table.rgb, goal, table.grounder)
+        if mistaken := set(map(str, plan.grounding.things)) - {one["name"] for one in table.things()}:
+            said = " and ".join(f"a {name}" for name in sorted(mistaken))
+            warnings.warn(f"the planner sees {said}, which is not there", UserWarning, stacklevel=1)
         names = slot_names(plan.grounding)
         self.shown = [Shown(one, names) for one in plan.rollouts]
         films = [film_data(one, (), names) for one in plan.rollouts]

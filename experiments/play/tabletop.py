@@ -20,6 +20,7 @@ from planning import (
     Instruction,
     LiteralController,
     PinholeCamera,
+    SegmentationGrounder,
     Thing,
 )
 from planning.controller import RESTING_HEIGHTS
@@ -39,6 +40,7 @@ class Tabletop:
         self.env = gym.make(env_id, control="primitive", record_frames=True, **options)
         self.base = cast(TabletopEnv, self.env.unwrapped)
         self.families = list(FAMILIES) if self.base.task.stacks else []
+        self.relations = [one.name for one in self.base.task.relations if one.name in RELATIONS]
         self.link = Link()
 
     def close(self) -> None:
@@ -60,7 +62,7 @@ class Tabletop:
 
     def _within_reach(self, act: Sequence[float]) -> np.ndarray:
         space = cast(gym.spaces.Box, self.env.action_space)
-        return np.clip(np.asarray(act, np.float32), space.low, space.high)
+        return np.clip(np.asarray(act, float), space.low, space.high).astype(np.float32)
 
     # -- what is seen and said ---------------------------------------------------------------------------------
 
@@ -101,12 +103,12 @@ class Tabletop:
             grounding = Grounding((), (), named)
         else:
             grounding = self.grounder(picture)
-        relations = [one.name for one in self.base.task.relations if one.name in RELATIONS]
-        return [one.text for one in grounding.instructions(*relations)]
+        return [one.text for one in grounding.instructions(*self.relations)]
 
     def names(self, rollout: Rollout, own_picture: bool) -> dict[int, str]:
-        """By how slots look, in a person's own picture as in the scene."""
-        return slot_names(self.grounder(rollout))
+        """By how slots look in a person's own picture, and in the scene by what they really show."""
+        grounder = self.grounder if own_picture else SegmentationGrounder.from_info(self.info)
+        return slot_names(grounder(rollout))
 
     # -- what is done ------------------------------------------------------------------------------------------
 
@@ -114,7 +116,10 @@ class Tabletop:
         """What a sentence asks for."""
         if len(self.link.acts) >= MOST_ACTS:
             raise Refused(f"{MOST_ACTS} acts were carried out in this scene; take a new one")
-        return Instruction.parse(text)
+        wish = Instruction.parse(text)
+        if wish.relation not in self.relations:
+            raise Refused(f"in this world nothing is put {wish.relation} a {wish.target.kind}: {wish.text!r}")
+        return wish
 
     def act(self, wish: Instruction, rollout: Rollout) -> np.ndarray:
         """Pick and place as the sentence says, what it names found by how it looks."""

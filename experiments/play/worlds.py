@@ -60,13 +60,17 @@ class World(Protocol):
 class Choice:
     """A world to choose: how it is made for an image size, and the checkpoint that knows it."""
 
+    name: str
     make: Callable[[int], World]
     checkpoint: str
 
 
 WORLDS = {
-    "rearrange": Choice(partial(Tabletop, "envs:RearrangeBlocks-v0"), "tabletop-small"),
-    "tabletop": Choice(partial(Tabletop, "envs:PutBlockInBowl-v0"), "tabletop-small"),
-    "cliport": Choice(partial(Tabletop, "envs:PutBlockInBowl-v0", scene="cliport"), "cliport"),
-    "cater": Choice(Cater, "cater"),
+    one.name: one
+    for one in (
+        Choice("rearrange", partial(Tabletop, "envs:RearrangeBlocks-v0"), "tabletop-small"),
+        Choice("tabletop", partial(Tabletop, "envs:PutBlockInBowl-v0"), "tabletop-small"),
+        Choice("cliport", partial(Tabletop, "envs:PutBlockInBowl-v0", scene="cliport"), "cliport"),
+        Choice("cater", Cater, "cater"),
+    )
 }

@@ -248,7 +248,7 @@ def test_what_is_no_json_and_no_text_gets_a_sentence(open_page) -> None:
 
 def test_a_wrong_link_is_said_and_another_scene_is_shown(open_page) -> None:
     opened = open_page("?seed=abc&say=hello").opened
-    assert "not 'abc'" in opened["problems"][0] and opened["scene"]["link"] == "seed=0"
+    assert "not 'abc'" in opened["problems"][0] and opened["scene"]["link"] == "world=rearrange&seed=0"
 
 
 def blank(width: int, height: int) -> bytes:
@@ -259,6 +259,47 @@ def blank(width: int, height: int) -> bytes:
 
 def upload(page: Page, data: bytes) -> Any:
     return page.client.post(f"/api/{page.name}/picture", content=data)
+
+
+def test_a_link_of_another_world_is_not_taken(open_page) -> None:
+    page = open_page("world=cater&seed=3")
+    assert page.opened["problems"] == ["this link is of the world 'cater', and here is 'rearrange' (--world)"]
+    assert page.opened["scene"]["seed"] == "0"
+    own = open_page(open_page("seed=3").opened["scene"]["link"])
+    assert own.opened["problems"] == [] and own.opened["scene"]["seed"] == "3"
+
+
+def test_an_endless_sentence_is_not_repeated(open_page) -> None:
+    page = open_page()
+    for verb, body in (("imagine", {"texts": [2000 * "word "]}), ("do", {"text": 2000 * "word "})):
+        assert "at most 600 characters" in page.refused(verb, **body)
+    assert len(page.refused("scene", query="seed=" + 3000 * "z")) < 650
+
+
+def test_in_a_world_without_towers_nothing_is_said_of_them(world_model) -> None:
+    with TestClient(server.create_app(world_model, WORLDS["tabletop"], horizon=3)) as client:
+        page = Page(client, "seed=100")
+        blocks = [one["name"] for one in page.opened["scene"]["things"] if one["name"].endswith("block")]
+        stacked = f"put the {blocks[0]} on the {blocks[1]}"
+        assert "in this world nothing is put on a block" in page.refused("do", text=stacked)
+        plan = page.ask("plan", text=page.opened["scene"]["task"])
+        said = [node["text"] for node in plan["tree"]]
+        assert said and all(" in the " in one for one in said)
+
+
+def test_slots_are_called_what_they_show(monkeypatch) -> None:
+    """However wrong the colours are that the planner sees, and it is told that they are wrong."""
+    model = WorldModel.from_pretrained("cliport")
+    with TestClient(server.create_app(model, WORLDS["cliport"], horizon=3)) as client:
+        page = Page(client, "seed=3")  # one of its things looks cyan, and none is
+        scene = page.opened["scene"]
+        there = {one["name"] for one in scene["things"]}
+        film = page.ask("imagine", texts=scene["sentences"][:1])["films"][0]
+        called = {one["name"] for one in film["slots"]} - {"arm", "table"}
+        assert called <= there
+        assert len(called) >= len(there) - 1
+        plan = page.ask("plan", text=scene["task"])
+        assert any("the planner sees a cyan block, which is not there" in one for one in plan["warnings"])
 
 
 def test_a_picture_is_taken_as_the_project_takes_pictures(open_page) -> None:
@@ -390,7 +431,7 @@ def test_nobody_waits_for_a_page_that_is_opened(world_model) -> None:
     asked.start()
     asked.join(5)
     assert not asked.is_alive()
-    with pytest.raises(Refused, match="2 pages are open"):  # the one that is being opened has its place
+    with pytest.raises(Refused, match="no more pages may be open than 2"):  # the one that is being opened has its place
         sessions.add(Link(2))
     may_end.set()
     opening.join(20)
@@ -585,7 +626,8 @@ def test_where_it_cannot_listen_it_says_why(capsys) -> None:
             assert printed.startswith("textocvp: ") and said in printed and "Traceback" not in printed
 
 
-def test_a_server_that_is_stopped_while_it_plans_says_so_and_no_more() -> None:
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_server_that_is_stopped_while_it_plans_says_so_and_no_more(how: signal.Signals) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -603,15 +645,32 @@ def test_a_server_that_is_stopped_while_it_plans_says_so_and_no_more() -> None:
 
         def plan() -> None:
             with suppress(OSError):  # the server goes away
-                ask(f"{name}/plan", text=ASKED)
+                ask(f"{name}/imagine", texts=12 * [ASKED])  # longer than anybody waits
 
         busy = threading.Thread(target=plan)
         busy.start()
         time.sleep(0.3)
-        run.send_signal(signal.SIGINT)
+        run.send_signal(how)
         said = run.stdout.read()
         busy.join()
+    assert run.returncode == 0
     assert "textocvp: stopped" in said and "Traceback" not in said and "ERROR" not in said
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "lacks"), [("non-oc-small", "slots of things"), ("ocvp-seq-small", "sentences")]
+)
+def test_a_model_that_cannot_be_played_with_is_refused(capsys, checkpoint: str, lacks: str) -> None:
+    assert command.main(["--no-browser", "--port", "0", "--checkpoint", checkpoint]) == 1
+    assert f"--checkpoint {checkpoint}: this model knows no {lacks}" in capsys.readouterr().err
+
+
+def test_a_model_of_another_world_is_told(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: None)
+    assert command.main(["--no-browser", "--port", "0", "--world", "tabletop", "--checkpoint", "cliport"]) == 0
+    assert "cliport was trained on another world (cliport)" in capsys.readouterr().err
+    assert command.main(["--no-browser", "--port", "0", "--world", "tabletop", "--checkpoint", "tabletop-small"]) == 0
+    assert "another world" not in capsys.readouterr().err
 
 
 def test_the_address_says_who_can_reach_it() -> None:

@@ -243,6 +243,9 @@ def test_a_phone_shows_all_of_it(visit, scheme) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 375
     light = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (min(light) > 200) == (scheme == "light")
+    # However much there is to say, it leaves room for the page.
+    page.evaluate("say(Array(200).fill('Warning: something.').join('\\n'), 'bad')")
+    assert page.locator("#message").bounding_box()["height"] <= 0.3 * 700 + 1
 
 
 def test_dragging_asks_the_environment(visit) -> None:
@@ -415,6 +418,7 @@ def test_a_goal_is_arranged(visit) -> None:
     before = page.locator("#scene").get_attribute("src")
     press(page, "arrange the goal")
     expect(use).to_be_visible()
+    expect(page.locator("#things button").first).to_be_focused()
     assert page.get_by_role("button", name="plan", exact=True).is_disabled()
     names = page.locator("#things button").all_inner_texts()
     block, bowl = (next(name for name in names if kind in name) for kind in ("block", "bowl"))
@@ -423,12 +427,27 @@ def test_a_goal_is_arranged(visit) -> None:
     assert page.locator("#scene").get_attribute("src") != before
     use.click()
     expect(page.locator("#message")).to_contain_text("press plan")
+    expect(page.get_by_label("goal", exact=True)).to_be_focused()
     assert page.locator("#scene").get_attribute("src") == before
     page.locator("#seed").fill("abc")  # which is refused, and changes nothing
     press(page, "show")
     expect(page.locator("#message")).to_contain_text("must be a whole number")
     press(page, "plan")
     expect(page.get_by_text(f"the {block} in the {bowl}. It is imagined to reach the goal.")).to_be_visible()
+
+
+def test_a_refused_link_stays_in_the_address_until_something_else_is_wished_for(visit) -> None:
+    query = "?world=cater&seed=3&say=the+cone+is+rotating"
+    page = visit(query)
+    expect(page.locator("#message")).to_contain_text("of the world 'cater'")
+    expect(page.locator("#message")).to_contain_text("Another scene is shown")
+    assert page.url.endswith(query) and "cone" not in page.get_by_label("sentence").first.input_value()
+    press(page, "imagine")
+    expect(page.locator(".film")).to_have_count(1)
+    press(page, "another sentence")
+    assert "world=rearrange" in page.url
+    press(page, "remove")
+    expect(page.get_by_label("sentence").first).to_be_focused()
 
 
 def test_a_page_that_was_sent_opens_offline(browser, tmp_path: Path) -> None:

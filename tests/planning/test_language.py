@@ -38,7 +38,7 @@ def test_a_goal_is_read_as_a_whole_or_refused_with_its_text_and_the_forms(text: 
     with pytest.raises(ValueError) as refused:
         Goal.parse(text)
     message = str(refused.value)
-    assert f"cannot read {unread!r} in the goal {text!r}" in message
+    assert f"cannot read {unread!r} in {text!r}" in message
     assert "'put the <color> block in the <color> bowl' or 'put the <color> block on the <color> block'" in message
 
 
@@ -55,7 +55,7 @@ def test_goal_is_checked() -> None:
         Goal((put_in("red", "blue"), put_in("red", "gray")))
     with pytest.raises(ValueError, match="'put the red block in the red bowl' names two things of one colour"):
         Goal.parse("put the red block in the red bowl")
-    with pytest.raises(ValueError, match="'octarine' in the goal 'put the octarine block in the blue bowl'"):
+    with pytest.raises(ValueError, match="'octarine' in 'put the octarine block in the blue bowl'"):
         Goal.parse("put the octarine block in the blue bowl")
     with pytest.raises(TypeError, match="must be a string, not int"):
         Goal.parse(3)  # type: ignore[arg-type]

@@ -138,7 +138,7 @@ function filmCard(film, title = film.text) {
     for (const {cell, slot, word} of cells) {
       const percent = film.attention[moment][slot][word];
       cell.textContent = percent;
-      cell.style.background = `rgb(var(--accent) / ${percent / 100})`;
+      cell.style.background = `rgb(var(--accent) / ${percent / 200})`;
     }
     if (apart) apart.textContent = `difference: ${film.apart_percent[moment]} % on average`;
   }
