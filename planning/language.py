@@ -156,9 +156,7 @@ def _parse(text: str) -> tuple[Instruction, ...]:
                 words = words[match.end() :]
                 break
         else:
-            raise ValueError(
-                f"cannot read {words!r} in {text!r}; it takes {_forms()}, several joined by 'and'"
-            )
+            raise ValueError(f"cannot read {words!r} in {text!r}; it takes {_forms()}, several joined by 'and'")
     from matplotlib.colors import is_color_like  # takes longer to import than all of the planner
 
     for thing in (thing for one in found for thing in one.things):
