@@ -34,6 +34,7 @@ from envs.splits import SPLITS
 from experiments.study.cater import CaterScene
 from planning import PinholeCamera
 from textocvp import WorldModel, cli
+from textocvp.film_page import told_apart
 
 TestClient = pytest.importorskip("fastapi.testclient", exc_type=ImportError).TestClient
 
@@ -109,6 +110,14 @@ def test_a_film_shows_what_the_model_imagines(open_page, world_model) -> None:
         assert {one["name"] for one in film["slots"]} == {
             "arm", "red block", "brown block", "cyan bowl", "gray bowl", "white bowl", "yellow bowl"
         }  # fmt: skip
+
+
+def test_things_of_one_colour_are_shown_in_several() -> None:
+    colors = np.array([[150, 150, 150], [200, 40, 40], [195, 45, 40], [40, 40, 200], [205, 40, 35]])
+    shown = told_apart(colors, [1, 2, 3, 4])
+    assert np.array_equal(shown[[0, 1, 3]], colors[[0, 1, 3]])
+    apart = np.abs(shown[:, None] - shown[None]).max(-1)[np.triu_indices(5, 1)]
+    assert apart.min() >= 40
 
 
 def test_an_act_is_shown_beside_what_was_imagined_and_a_link_brings_all_of_it_back(open_page) -> None:

@@ -18,6 +18,7 @@ from textocvp.files import replace_text
 from textocvp.rollout import Rollout
 
 SEEN = 0.5  # presence of a slot from which on it is named
+ALIKE = 30  # of 0..255 in each channel: colours that differ less are shown lighter and darker
 
 
 def film_data(
@@ -57,7 +58,7 @@ def film_data(
         "count": T,
         "frames": picture_url(frames_THW3.reshape(T * H, W, 3)),  # one below the other
         "runs": run_lengths(first_K[one.masks[0].argmax(1).cpu().numpy()]),
-        "colors": colors_K3.tolist(),
+        "colors": told_apart(colors_K3, [slots[0] for _, slots in sorted(shown.items())]).tolist(),
         "slots": [{"slot": slots[0], "name": name} for name, slots in sorted(shown.items())],
     }
     if one.attention is not None and words:
@@ -77,6 +78,16 @@ def film_data(
         )
         film["apart_percent"] = (apart_THW3.mean((1, 2, 3)) / 2.55).round(1).tolist()
     return film
+
+
+def told_apart(colors_K3: np.ndarray, listed: Sequence[int]) -> np.ndarray:
+    """The colours (K, 3), those of listed slots that look like an earlier one in turns lighter and darker."""
+    found_K3 = colors_K3.copy()
+    for at, slot in enumerate(listed):
+        alike = sum(int(np.abs(colors_K3[slot] - colors_K3[other]).max()) < ALIKE for other in listed[:at])
+        if alike:
+            found_K3[slot] = (colors_K3[slot] + (255 if alike % 2 else 0)) // 2
+    return found_K3
 
 
 def slot_names(rollout: Rollout) -> dict[int, str]:
