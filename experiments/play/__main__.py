@@ -105,6 +105,8 @@ def serve(command: PlayCommand) -> None:
         server.run(sockets=[listening])
     finally:
         ended.set()
+        if app.state.sessions.left:
+            _end()
 
 
 def _end_in_time(server: Server, ended: threading.Event) -> None:
@@ -113,8 +115,13 @@ def _end_in_time(server: Server, ended: threading.Event) -> None:
         if ended.wait(0.2):
             return
     if not ended.wait(2 * GRACE):
-        print("textocvp: stopped", file=sys.stderr, flush=True)
-        os._exit(0)
+        _end()
+
+
+def _end() -> None:
+    """End at once: a thread that computes would abort the interpreter, or keep it."""
+    print("textocvp: stopped", file=sys.stderr, flush=True)
+    os._exit(0)
 
 
 def _is_news(record: logging.LogRecord) -> bool:

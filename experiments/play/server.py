@@ -20,7 +20,7 @@ from fastapi import Body, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 from starlette.exceptions import HTTPException
 
 from envs.colors import COLORS
@@ -48,9 +48,15 @@ def _as_text(said: str) -> str:
     return said
 
 
+def _short(said: str) -> str:
+    if len(said) > LONGEST_TEXT:
+        raise ValueError(f"it has {len(said)} characters, and at most {LONGEST_TEXT} are read")
+    return said
+
+
 Text = Annotated[str, AfterValidator(_as_text)]
 Said = Annotated[Text, Body(embed=True)]
-Sentence = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_as_text)]
+Sentence = Annotated[Text, AfterValidator(_short)]
 Number = Annotated[float, Body(embed=True)]
 
 
@@ -67,6 +73,7 @@ class Sessions:
     idle_seconds: float = IDLE_SECONDS
     open: dict[str, Session] = field(default_factory=dict)
     heard_of: dict[str, float] = field(default_factory=dict)  # when each last said something
+    left: list[Session] = field(default_factory=list)  # still busy in their threads when the server ended
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, link: Link) -> tuple[str, Session]:
@@ -99,11 +106,15 @@ class Sessions:
         with self.lock:
             session = self.open.pop(name, None)
             self.heard_of.pop(name, None)
-        if session is not None and session.lock.acquire(timeout=wait):
-            try:
-                session.close()
-            finally:
-                session.lock.release()
+        if session is None:
+            return
+        if not session.lock.acquire(timeout=wait):
+            self.left.append(session)
+            return
+        try:
+            session.close()
+        finally:
+            session.lock.release()
 
     def sweep(self) -> None:
         """Close what has been silent for too long."""
@@ -139,12 +150,10 @@ def create_app(world_model: WorldModel, choice: Choice, most_pages: int = 8, hor
                 finally:
                     session.close()
 
-        aside = [asyncio.create_task(sweep()), asyncio.create_task(run_in_threadpool(warm_up))]
+        sweeping, warming = asyncio.create_task(sweep()), asyncio.create_task(run_in_threadpool(warm_up))
         yield
-        for task in aside:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
+        sweeping.cancel()
+        await warming  # a thread that computes must not outlive the interpreter
         for name in list(sessions.open):
             sessions.close(name, wait=1)
 
