@@ -100,13 +100,14 @@ class CaterUnit:
 
     def run(self, worker: Worker) -> dict[tuple[str, str, str], Any]:
         """Imagine, compare, judge: (method, variant, metric) -> figure, of truths a list."""
-        ours, clip, truth = worker.world_model, self.scene.clip(), watched(self.scene)
+        ours, clip = worker.world_model, self.scene.clip()
+        others = [replace(self.scene, variant=k + 1) for k in range(self.variants)]
+        films = {one.clip(): one.watch(SIDE) for one in (self.scene, *others)}
+        truth = as_episode(clip, *films[clip])
         first, T = truth.frames[0], len(truth.frames)
         real_T3HW = torch.from_numpy(truth.frames).permute(0, 3, 1, 2).float() / 255
         scorer = Scorer(real_T3HW, self.measures, upper=False)
         figures: dict[tuple[str, str, str], Any] = {}
-        others = [replace(self.scene, variant=k + 1) for k in range(self.variants)]
-        films = {one.clip(): one.watch(SIDE) for one in (self.scene, *others)}
         happened = {asked: judge(labels, asked, labels[0]) for asked, (_, labels) in films.items()}
         models: dict[str, Any] = {"ours": ours, **{m.key: worker.model(m.load) for m in self.models}}
         still = Seen(real_T3HW[:1], drawn(ours.parse(truth.frames[:1], seed=self.seed), SIDE).labels)
@@ -144,8 +145,11 @@ class CaterUnit:
 
 def watched(scene: CaterScene, worker: Worker | None = None) -> Episode:
     """What the simulator shows of a scene."""
-    clip = scene.clip()
-    frames, labels = scene.watch(SIDE)
+    return as_episode(scene.clip(), *scene.watch(SIDE))
+
+
+def as_episode(clip: Actions, frames: np.ndarray, labels: np.ndarray) -> Episode:
+    """Frames (T, H, W, 3) and labels (T, H, W) of a clip."""
     objects = tuple(EpisodeObject(k, 1 + k, thing.shape, thing.color) for k, thing in enumerate(clip.things))
     return Episode(frames=frames, instruction=clip.instruction, segmentation=labels, objects=objects)
 

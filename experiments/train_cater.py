@@ -154,7 +154,9 @@ def steps(args: Args) -> list[Step]:
     plain = ("predictor.appearance=false", "text.kind=transformer")
     color = ("predictor.appearance=false", "predictor.color_bias=true", "text.kind=lexicon")
     savi_parser = "savi-clips" if scale.clips[0] else "savi-stills"
-    savi_text = ("--set", "text.kind=transformer", "predictor.window=29")
+    savi_text: tuple[str, ...] = ("--preset", "savi-cater", "--learning-rate", "2e-4")
+    if scale.savi == "savi-small":
+        savi_text = ("--learning-rate", "1e-3", "--set", "text.kind=transformer", "predictor.window=29")
     found = [
         collect("train", scale.train),
         collect("val", scale.val),
@@ -176,8 +178,7 @@ def steps(args: Args) -> list[Step]:
               "--start", f"{out}/savi-stills/checkpoint", "--learning-rate", "2e-4"),
         slots("savi-slots", savi_parser),
         train("savi", "predictor", "savi-slots", scale.savi_predictor, "--parser", f"{out}/{savi_parser}/checkpoint",
-              *(("--preset", scale.savi) if scale.savi == "savi-cater" else savi_text), "--learning-rate",
-              "2e-4" if scale.savi == "savi-cater" else "1e-3", *fast),
+              *savi_text, *fast),
         train("vqvae", "vqvae", "", scale.vqvae),
         train("mage", "mage", "vqvae", scale.mage, "--vqvae", f"{out}/vqvae/checkpoint", "--autoregressive", "0.8",
               "--changed-weight", "1"),

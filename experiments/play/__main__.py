@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from uvicorn import Server
 
-GRACE = 2.0  # seconds in which answers that are under way may still be given when the server is stopped
+GRACE = 2  # seconds in which answers that are under way may still be given when the server is stopped
 
 
 class Mistake(Exception):
@@ -96,7 +96,7 @@ def serve(command: PlayCommand) -> None:
         threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
     import uvicorn
 
-    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=int(GRACE))
+    config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=GRACE)
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     server = uvicorn.Server(config)
     ended = threading.Event()
@@ -147,11 +147,12 @@ def load(command: PlayCommand) -> FastAPI:
 
     torch.set_num_threads(max(1, command.threads))
     choice = WORLDS[command.world]
+    name = command.checkpoint or choice.checkpoint
     try:
-        world_model = WorldModel.from_pretrained(command.checkpoint or choice.checkpoint)
+        world_model = WorldModel.from_pretrained(name)
     except CheckpointError as error:
         raise Mistake(str(error)) from None
-    name, model = command.checkpoint or choice.checkpoint, world_model.model
+    model = world_model.model
     if model.config.parser.num_slots == 1 or not model.predictor.uses_text:
         lacks = "slots of things" if model.predictor.uses_text else "sentences"
         raise Mistake(f"--checkpoint {name}: this model knows no {lacks}, and there is nothing to play with")
