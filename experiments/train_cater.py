@@ -38,7 +38,7 @@ class Scale:
 
     train: int
     val: int
-    seen: int  # the first clips, from which the voting parsers learn
+    seen: int  # the first clips, from which the voting parsers learn, and MAGE
     votes: tuple[int, int]
     draw: tuple[int, int]
     predictor: tuple[int, int]
@@ -180,8 +180,8 @@ def steps(args: Args) -> list[Step]:
         train("savi", "predictor", "savi-slots", scale.savi_predictor, "--parser", f"{out}/{savi_parser}/checkpoint",
               *savi_text, *fast),
         train("vqvae", "vqvae", "", scale.vqvae),
-        train("mage", "mage", "vqvae", scale.mage, "--vqvae", f"{out}/vqvae/checkpoint", "--autoregressive", "0.8",
-              "--changed-weight", "1"),
+        train("mage", "mage", "vqvae", scale.mage, *seen[:2], "--vqvae", f"{out}/vqvae/checkpoint",
+              "--autoregressive", "0.8", "--changed-weight", "1"),
     ]  # fmt: skip
     return [step for step in found if step.updates != 0]
 

@@ -273,11 +273,13 @@ def _train(arguments: list[str]) -> None:
     from textocvp.data.cache import CacheError
     from textocvp.training import parser as train_parser
     from textocvp.training import predictor as train_predictor
+    from textocvp.training import restorer as train_restorer
     from textocvp.training.run import SettingsError
 
     Stage = Union[  # noqa: UP007
         Annotated[train_parser.ParserTraining, tyro.conf.subcommand("parser")],
         Annotated[train_predictor.PredictorTraining, tyro.conf.subcommand("predictor")],
+        Annotated[train_restorer.RestorerTraining, tyro.conf.subcommand("restorer")],
         Annotated[train_vqvae.VQVAETraining, tyro.conf.subcommand("vqvae")],
         Annotated[train_mage.MageTraining, tyro.conf.subcommand("mage")],
     ]
@@ -303,6 +305,7 @@ def _train(arguments: list[str]) -> None:
     train: dict[type, Callable[[Any], object]] = {
         train_parser.ParserTraining: train_parser.train,
         train_predictor.PredictorTraining: train_predictor.train,
+        train_restorer.RestorerTraining: train_restorer.train,
         train_vqvae.VQVAETraining: train_vqvae.train,
         train_mage.MageTraining: train_mage.train,
     }

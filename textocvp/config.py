@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_ty
 from textocvp.inputs import OwnFrames
 from textocvp.parsers import PARSERS, ParserConfig
 from textocvp.parsers.placed import PlacedConfig
+from textocvp.pictures.restorer import RestorerConfig
 from textocvp.predictors import PREDICTORS, PredictorConfig
 from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.renderers import RENDERERS, RendererConfig
@@ -53,6 +54,8 @@ class ModelConfig:
     stage: Literal["parser", "predictor"] = "predictor"
     # What pictures of its world are like, for a warning about others; None where nobody measured it.
     own_frames: OwnFrames | None = None
+    # A network that takes noise and JPEG off pictures of its world; None where it has not been trained.
+    restorer: RestorerConfig | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, ready for JSON."""

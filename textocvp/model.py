@@ -25,6 +25,7 @@ from textocvp.checkpoint import (
 from textocvp.config import ModelConfig
 from textocvp.parsers import build_parser
 from textocvp.parsers.votes import VotesConfig
+from textocvp.pictures.restorer import LEVELS, Restorer
 from textocvp.predictors import build_predictor
 from textocvp.predictors.base import SlotPredictor
 from textocvp.renderers import build_renderer
@@ -40,7 +41,7 @@ class TextOCVP(
 ):
     """The text-conditioned object-centric video predictor: `parser`, `text`, `predictor`, `renderer`.
 
-    Where its config has an `outcome`, it also has a second predictor of that name.
+    Where its config has an `outcome`, it also has a second predictor of that name, and likewise a `restorer`.
 
     Args:
         text_files: the text encoder's own folder, of a checkpoint that is being loaded.
@@ -60,6 +61,7 @@ class TextOCVP(
         if config.outcome is not None:
             self.outcome = build_predictor(config.outcome, config.parser.layout, config.text.dim)
         self.renderer = build_renderer(config.renderer, config.parser.layout, config.parser.image_size)
+        self.restorer = None if config.restorer is None else Restorer(config.restorer)
 
     @property
     def device(self) -> torch.device:
@@ -119,6 +121,8 @@ def check_parts(config: ModelConfig) -> None:
             raise ValueError("renderer.kind 'upsample' draws the one slot of a frame: set parser.kind=holistic")
         if side < 16 or side & (side - 1):
             raise ValueError(f"renderer.kind 'upsample' draws frames of 16, 32, 64, 128, ... pixels, not {side}")
+    if config.restorer is not None and side % 2 ** (LEVELS - 1):
+        raise ValueError(f"a restorer takes frames of a multiple of {2 ** (LEVELS - 1)} pixels, not {side}")
     if isinstance(renderer, PatchConfig) and side % renderer.patches:
         raise ValueError(f"renderer.patches: {renderer.patches} patches do not divide {side} pixels evenly")
     if isinstance(renderer, FeatureConfig):

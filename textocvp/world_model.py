@@ -278,7 +278,7 @@ class WorldModel:
         own = self.model.config.own_frames
         if own is None or frames_BT3HW.shape[-2:] != self.image_size:
             return frames_BT3HW
-        frames_BT3HW, done = put_right(frames_BT3HW, own)
+        frames_BT3HW, done = put_right(frames_BT3HW, own, self.model.restorer)
         if done:
             said = f"the picture does not look like those that this model was trained on: it is {', and '.join(done)}"
             warnings.warn(said, ForeignPictureWarning, stacklevel=depth + 1)

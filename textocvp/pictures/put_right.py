@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -24,37 +26,55 @@ def grain(values_B3HW: Tensor) -> Tensor:
     return ((step_BHW >= STEPS[0]) & (step_BHW <= STEPS[1])).float().mean((1, 2))
 
 
-def put_right(frames_BT3HW: Tensor, own: OwnFrames) -> tuple[Tensor, list[str]]:
+def put_right(
+    frames_BT3HW: Tensor, own: OwnFrames, restorer: Callable[[Tensor], Tensor] | None = None
+) -> tuple[Tensor, list[str]]:
     """Videos, -1..1, in the light of the model's own and without grain; and what was done to them, in words.
 
     What is done to a video is decided by its first frame. One on the model's own canvas, in its light and no grainier
     than its own, stays as it is to the last bit.
+
+    Args:
+        restorer: brings back what a factor does not (`Restorer`).
     """
     if not own.canvas:
         return frames_BT3HW, []
     values_BT3HW = (frames_BT3HW + 1) * 127.5
     own_3 = from_hex(own.canvas, values_BT3HW)
-    grainy_B = _gain(values_BT3HW, own_3).isfinite() & (grain(values_BT3HW[:, 0]) > own.grain + MORE_GRAIN)
-    if grainy_B.any():  # first, for the median of a grainy picture is not that of its canvas
-        values_BT3HW = values_BT3HW.clone()
-        values_BT3HW[grainy_B] = torch.stack([_smooth(video) for video in values_BT3HW[grainy_B]])
-    gain_B = _gain(values_BT3HW, own_3)
+    first_B3HW = values_BT3HW[:, 0].clone()
+    grainy_B = _gain(first_B3HW, own_3).isfinite() & (grain(first_B3HW) > own.grain + MORE_GRAIN)
+    if grainy_B.any():  # the median of a grainy picture is not that of its canvas
+        first_B3HW[grainy_B] = _smooth(first_B3HW[grainy_B])
+    gain_B = _gain(first_B3HW, own_3)
     other_B = gain_B.isfinite() & ((gain_B - 1).abs() > SAME_LIGHT)
-    if not (other_B | grainy_B).any():
+    changed_B = other_B | grainy_B
+    if not changed_B.any():
         return frames_BT3HW, []
-    gain_B1111 = torch.where(other_B, gain_B, 1.0)[:, None, None, None, None]
-    # What is white may have been brighter still: halfway between the least and the most that it can have been.
-    burnt_BT3HW = (values_BT3HW >= 255) & (gain_B1111 < 1)
-    right_BT3HW = torch.where(burnt_BT3HW, (1 + gain_B1111) / 2 * 255, values_BT3HW * gain_B1111).clamp(0, 255)
+    right_BT3HW = in_light(values_BT3HW, torch.where(other_B, gain_B, 1.0)[:, None, None, None, None])
+    lost_B = grainy_B | (other_B & (gain_B < 1))
+    if restorer is not None and lost_B.any():
+        restored_N3HW = restorer(right_BT3HW[lost_B].flatten(0, 1) / 127.5 - 1)
+        right_BT3HW[lost_B] = (restored_N3HW + 1).unflatten(0, (-1, frames_BT3HW.shape[1])) * 127.5
+    if grainy_B.any():
+        right_BT3HW[grainy_B] = torch.stack([_smooth(video) for video in right_BT3HW[grainy_B]])
     done = ["grainy, as noise and JPEG make it, and was smoothed"] * bool(grainy_B.any())
     done += [f"in about {1 / gain:.1f} times the light, which was put right" for gain in gain_B[other_B][:1].tolist()]
-    changed_B1111 = (other_B | grainy_B)[:, None, None, None, None]
-    return torch.where(changed_B1111, right_BT3HW.round() / 127.5 - 1, frames_BT3HW), done
+    right_BT3HW = right_BT3HW.clamp(0, 255).round() / 127.5 - 1
+    return torch.where(changed_B[:, None, None, None, None], right_BT3HW, frames_BT3HW), done
 
 
-def _gain(values_BT3HW: Tensor, own_3: Tensor) -> Tensor:
-    """(B,) how many times brighter the first frames must become to have this canvas; NaN where they have another."""
-    found_B3 = canvas(values_BT3HW[:, 0])
+def in_light(values: Tensor, gain: Tensor | float) -> Tensor:
+    """Values 0..255 made `gain` times as bright.
+
+    What is white may have been brighter still: halfway between the least and the most that it can have been.
+    """
+    gain = torch.as_tensor(gain, dtype=values.dtype, device=values.device)
+    return torch.where((values >= 255) & (gain < 1), (1 + gain) / 2 * 255, values * gain).clamp(0, 255)
+
+
+def _gain(values_B3HW: Tensor, own_3: Tensor) -> Tensor:
+    """(B,) how many times brighter pictures must become to have this canvas; NaN where they have another."""
+    found_B3 = canvas(values_B3HW)
     gain_B = own_3.sum() / found_B3.sum(1).clamp_min(1)
     same_B = ((found_B3 * gain_B[:, None] - own_3).abs() <= SAME_CANVAS).all(1)
     return torch.where(same_B & (gain_B < MOST_LIGHT) & (gain_B > 1 / MOST_LIGHT), gain_B, torch.nan)

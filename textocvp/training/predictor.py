@@ -274,8 +274,10 @@ def assemble(
             model = TextOCVP(replace(config, text=text, stage="predictor"))
         model.parser.load_state_dict(trained.parser.state_dict())
         model.renderer.load_state_dict(trained.renderer.state_dict())
-    for part in (model.parser, model.renderer):
-        part.requires_grad_(False).eval()
+        model.restorer = trained.restorer
+    for part in (model.parser, model.renderer, model.restorer):
+        if part is not None:
+            part.requires_grad_(False).eval()
     return model
 
 

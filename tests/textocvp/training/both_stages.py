@@ -6,6 +6,7 @@ torchrun --standalone --nproc_per_node 2 -m tests.textocvp.training.both_stages 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -15,10 +16,12 @@ from textocvp import cli
 from textocvp.baselines.mage import MAGE_PRESETS, MageConfig
 from textocvp.baselines.mage.axial import AxialConfig
 from textocvp.baselines.mage.vqvae import VQVAEConfig
+from textocvp.inputs import OwnFrames
 from textocvp.presets import PRESETS
 from textocvp.training import run as training
 
 STEPS = 3
+OWN = OwnFrames(2, 20.0, 18.0, canvas="2f2f2f", grain=0.1)  # of toy episodes
 MAGE = MageConfig(
     name="tiny-mage",
     vqvae=VQVAEConfig(image_size=32, channels=8, blocks=1, codebook_size=16, code_dim=8),
@@ -31,6 +34,7 @@ RUNS = {
     "parser, single frames": ["parser", "--preset", PLACED.name, "--clip", "1"],
     "predictor, causal, image loss": ["predictor", "--horizon", "2", "--image-weight", "1.0", "--parser", PLACED.name],
     "predictor, window": ["predictor", "--horizon", "2", "--parser", PUBLISHED.name],
+    "restorer": ["restorer", "--parser", PLACED.name],
     "vqvae": ["vqvae", "--preset", MAGE.name, "--restart-every", "1", "--stride", "2"],
     "mage": ["mage", "--preset", MAGE.name, "--vqvae", "vqvae/checkpoint"],
 }
@@ -40,7 +44,7 @@ def write_inputs(folder: Path) -> None:
     """Toy episodes and a checkpoint of each family."""
     write_toy_episodes(folder / "train.h5", [9, 8, 9, 9, 7])
     write_toy_episodes(folder / "val.h5", [9, 8], seed=1)
-    for config in (PLACED, PUBLISHED):
+    for config in (replace(PLACED, own_frames=OWN), PUBLISHED):
         build(config).save_pretrained(folder / config.name)
 
 
@@ -49,7 +53,11 @@ def main(folder: Path, name: str) -> None:
     tiny = {config.name: config for config in (PLACED, PUBLISHED)}
     with patch.dict(PRESETS, tiny), patch.dict(MAGE_PRESETS, {MAGE.name: MAGE}), patch.object(training, "LOG_EVERY", 1):
         for run, command in RUNS.items():
-            inputs = {"predictor": folder, "mage": folder / name}  # what the last argument is found in
+            inputs = {
+                "predictor": folder,
+                "restorer": folder,
+                "mage": folder / name,
+            }  # what the last argument is found in
             if command[0] in inputs:
                 command = [*command[:-1], str(inputs[command[0]] / command[-1])]
             files = ["--data", folder / "train.h5", "--val", folder / "val.h5", "--out", folder / name / run]
