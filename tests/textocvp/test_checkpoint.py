@@ -51,8 +51,8 @@ SHA256 = {
     "mage-small": "aa57385cef278bc051bc5c3e0479486c2c8a275d557bf476d57cc3a6c6a9c6dd",
     "non-oc-small": "4e1d6426c7f11faff46fa73a73627c6b60b60b458ebd1db6148a0db75fbf2d6d",
     "ocvp-seq-small": "72eb0b316789da74aedbbda90da195278c29b5e43457f3d7c59aecf8d28bcab8",
-    "tabletop-small": "18aa70b4474cf023d12c1d6fb4b7c12ae4100453bca3d004371439c02006dc6f",
-    "tabletop-small-40": "c661b48b9daa638025ec59c7fb89e1e30e17867b01195002336abe349b5d9961",
+    "tabletop-small": "71991397038887e555553766e23ddee5500e0054bacd1836f88dae35a562fd40",
+    "tabletop-small-40": "5af511f57c8f553d43dadb58621561e8eeb2976b0b91a2647fc97e070c53e1cf",
 }
 
 

@@ -55,8 +55,8 @@ def put_right(
     if restorer is not None and lost_B.any():
         restored_N3HW = restorer(right_BT3HW[lost_B].flatten(0, 1) / 127.5 - 1)
         right_BT3HW[lost_B] = (restored_N3HW + 1).unflatten(0, (-1, frames_BT3HW.shape[1])) * 127.5
-    if grainy_B.any():
-        right_BT3HW[grainy_B] = torch.stack([_smooth(video) for video in right_BT3HW[grainy_B]])
+    if lost_B.any():  # things become of one colour again
+        right_BT3HW[lost_B] = torch.stack([_smooth(video) for video in right_BT3HW[lost_B]])
     done = ["grainy, as noise and JPEG make it, and was smoothed"] * bool(grainy_B.any())
     done += [f"in about {1 / gain:.1f} times the light, which was put right" for gain in gain_B[other_B][:1].tolist()]
     right_BT3HW = right_BT3HW.clamp(0, 255).round() / 127.5 - 1
