@@ -49,7 +49,8 @@ def own_of(model: WorldModel) -> OwnFrames:
 
 def right(model: WorldModel, *pictures: np.ndarray) -> tuple[np.ndarray, list[str]]:
     frames = checked_frames(np.stack(pictures), model.image_size, torch.device("cpu"))[:, None]
-    done, said = put_right(frames, own_of(model))
+    with torch.no_grad():
+        done, said = put_right(frames, own_of(model), model.model.restorer)
     return ((done[:, 0] + 1) * 127.5).round().permute(0, 2, 3, 1).numpy(), said
 
 

@@ -52,11 +52,8 @@ def put_right(
         return frames_BT3HW, []
     right_BT3HW = in_light(values_BT3HW, torch.where(other_B, gain_B, 1.0)[:, None, None, None, None])
     lost_B = grainy_B | (other_B & (gain_B < 1))
-    if restorer is not None and lost_B.any():
-        restored_N3HW = restorer(right_BT3HW[lost_B].flatten(0, 1) / 127.5 - 1)
-        right_BT3HW[lost_B] = (restored_N3HW + 1).unflatten(0, (-1, frames_BT3HW.shape[1])) * 127.5
-    if lost_B.any():  # things become of one colour again
-        right_BT3HW[lost_B] = torch.stack([_smooth(video) for video in right_BT3HW[lost_B]])
+    if lost_B.any():  # each video by itself: its place in a batch must not matter, nor the batch fill the memory
+        right_BT3HW[lost_B] = torch.stack([_recover(video, restorer) for video in right_BT3HW[lost_B]])
     done = ["grainy, as noise and JPEG make it, and was smoothed"] * bool(grainy_B.any())
     done += [f"in about {1 / gain:.1f} times the light, which was put right" for gain in gain_B[other_B][:1].tolist()]
     right_BT3HW = right_BT3HW.clamp(0, 255).round() / 127.5 - 1
@@ -70,6 +67,13 @@ def in_light(values: Tensor, gain: Tensor | float) -> Tensor:
     """
     gain = torch.as_tensor(gain, dtype=values.dtype, device=values.device)
     return torch.where((values >= 255) & (gain < 1), (1 + gain) / 2 * 255, values * gain).clamp(0, 255)
+
+
+def _recover(values_T3HW: Tensor, restorer: Callable[[Tensor], Tensor] | None) -> Tensor:
+    """A video without grain, in which what is of one colour is so again."""
+    if restorer is not None:
+        values_T3HW = (restorer(values_T3HW / 127.5 - 1) + 1) * 127.5
+    return _smooth(values_T3HW)
 
 
 def _gain(values_B3HW: Tensor, own_3: Tensor) -> Tensor:
