@@ -51,7 +51,9 @@ class ParserTraining(ClipTraining):
     renderer, are trained."""
 
     start: Path | None = None
-    """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips."""
+    """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips. With
+    `first_redraw` not before `steps` its parser only learns to see better, and all else of the checkpoint stays as it
+    is, its predictor, too."""
 
 
 class ParserStage(nn.Module):
@@ -127,7 +129,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
         model = TextOCVP(config)
     if args.start is not None:
-        go_on_from(model, args.start)
+        model = go_on_from(model, args.start, whole=model.parser.taught and args.first_redraw >= args.steps)
     if args.taught is not None:
         keep_taught(model, args.taught)
     model.to(accelerator.device)
@@ -174,13 +176,20 @@ def train(args: ParserTraining) -> ParserMetrics | None:
     return metrics
 
 
-def go_on_from(model: TextOCVP, checkpoint: Path) -> None:
-    """Give parser and renderer the weights of a checkpoint; a SettingsError if it was built otherwise."""
-    source = TextOCVP.from_pretrained(str(checkpoint))
+def go_on_from(model: TextOCVP, checkpoint: Path, whole: bool) -> TextOCVP:
+    """The model with parser and renderer of a checkpoint, or that checkpoint as a whole.
+
+    Raises:
+        SettingsError: if the checkpoint was built otherwise.
+    """
+    source = TextOCVP.from_pretrained(str(checkpoint)).train()
     if (source.config.parser, source.config.renderer) != (model.config.parser, model.config.renderer):
         raise SettingsError(f"{checkpoint} is built otherwise: give the same preset and set as it was trained with")
+    if whole:
+        return source
     model.parser.load_state_dict(source.parser.state_dict())
     model.renderer.load_state_dict(source.renderer.state_dict())
+    return model
 
 
 def keep_taught(model: TextOCVP, checkpoint: Path) -> None:

@@ -2,8 +2,8 @@
 
 The camera stands still, so the median of an episode's frames shows the scene without what moves, and its commonest
 colours are those of floor and table. What has none of them is foreground; gray parts of it that reach into the upper
-third are the robot, and connected parts of one hue are objects. Where no colours are common because light falls
-unevenly on a gray floor (CATER), the floor's light is a smooth surface, and there is no robot.
+third are the robot, unless they stand still, and connected parts of one hue are objects. Where no colours are common
+because light falls unevenly on a gray floor (CATER), the floor's light is a smooth surface, and there is no robot.
 """
 
 from dataclasses import dataclass, field
@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -36,9 +37,11 @@ FLOOR_ORDER = 4  # of the polynomial that the floor's light is
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What an episode shows without its things: its commonest colours (N, 3), or the light (H, W) on a gray floor."""
+    """What stays behind the things of an episode: its commonest colours, or the light on a gray floor."""
 
+    median_HW3: NDArray[np.float32]
     tones_N3: NDArray[np.float32]
+    standing_HW: NDArray[np.bool_] | None = None  # where the median shows a thing, and neither robot nor background
     floor_HW: NDArray[np.float32] | None = None
 
 
@@ -85,7 +88,9 @@ def backdrop(frames_THW3: NDArray[np.uint8]) -> Backdrop:
     # Several tones that follow each other are one surface in uneven light.
     steps = np.diff(np.sort(tones_N3.mean(-1)))
     uneven = len(steps) > 1 and steps.max() <= 4 * TONE_RADIUS
-    return Backdrop(tones_N3, _floor(median_HW3) if uneven or near_HW.mean() < FLAT else None)
+    if uneven or near_HW.mean() < FLAT:
+        return Backdrop(median_HW3, tones_N3, floor_HW=_floor(median_HW3))
+    return Backdrop(median_HW3, tones_N3, _frame_masks(median_HW3, Backdrop(median_HW3, tones_N3)) > 1)
 
 
 def _floor(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -127,7 +132,7 @@ def video_masks(frames_NHW3: NDArray[np.uint8], behind: Backdrop) -> Labels:
     """Labels (N, H, W) of frames: 0 background, 1 robot, 2 and more one for each object of a frame."""
     frames = frames_NHW3.astype(np.float32)
     if behind.floor_HW is None:
-        return np.stack([_frame_masks(frame_HW3, behind.tones_N3) for frame_HW3 in frames])
+        return np.stack([_frame_masks(frame_HW3, behind) for frame_HW3 in frames])
     return np.stack([_masks_on_floor(frame_HW3, behind.floor_HW) for frame_HW3 in frames])
 
 
@@ -147,17 +152,20 @@ def _numbered(things_HW: NDArray[np.int64], labels_HW: Labels) -> Labels:
     return labels_HW
 
 
-def _frame_masks(frame_HW3: NDArray[np.float32], tones_K3: NDArray[np.float32]) -> Labels:
+def _frame_masks(frame_HW3: NDArray[np.float32], behind: Backdrop) -> Labels:
+    tones_K3 = behind.tones_N3
     apart_HWK = np.abs(frame_HW3[:, :, None] - tones_K3).max(-1)
     # Where floor and table meet there is a line of mixed colours, one or two pixels thick.
     solid = ndimage.binary_opening(apart_HWK.min(-1) > TONE_RADIUS, np.ones((2, 2)))
     solid &= ~(_border(solid) & _mostly(tones_K3[apart_HWK.argmin(-1)], frame_HW3, MIXED, NOISE))
     labels = np.zeros(solid.shape, np.uint8)
     gray = solid & (np.ptp(frame_HW3, axis=-1) <= GRAY)
+    if behind.standing_HW is not None:  # a gray thing that the robot touches
+        gray &= ~(behind.standing_HW & (np.abs(frame_HW3 - behind.median_HW3).max(-1) <= TONE_RADIUS))
     parts, _ = ndimage.label(gray)
     high = np.unique(parts[: len(parts) // 3])
     labels[np.isin(parts, high[high > 0])] = 1
-    return _numbered(_parts_of_one_hue(frame_HW3, solid & (labels == 0)), labels)
+    return _numbered(_split_by_hue(frame_HW3, _parts_of_one_hue(frame_HW3, solid & (labels == 0))), labels)
 
 
 def _border(solid_HW: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -179,11 +187,15 @@ def _mostly(
     return mostly_HW
 
 
+def _chroma(frame_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
+    return frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
+
+
 def _parts_of_one_hue(
     frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_], same_hue: float = SAME_HUE
 ) -> NDArray[np.int64]:
     """Connected parts, each with a number above 0."""
-    chroma_HW3 = frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
+    chroma_HW3 = _chroma(frame_HW3)
     count = int(inside_HW.sum())
     number = np.zeros(inside_HW.shape, int)
     number[inside_HW] = np.arange(count)
@@ -202,3 +214,26 @@ def _parts_of_one_hue(
     # Pixels of mixed colours between things go to the nearest part.
     nearest = ndimage.distance_transform_edt(parts_HW == 0, return_distances=False, return_indices=True)
     return np.where(inside_HW, parts_HW[tuple(nearest)], 0) if parts_N.any() else parts_HW
+
+
+def _split_by_hue(frame_HW3: NDArray[np.float32], parts_HW: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Parts whose inside has two hues are two things: pixels of mixed colours linked a block with its bowl."""
+    chroma_HW3, found_HW = _chroma(frame_HW3), parts_HW.copy()
+    for part in np.unique(parts_HW[parts_HW > 0]):
+        its_HW = parts_HW == part
+        inside_HW = its_HW & ~_border(its_HW)
+        hues_N3 = chroma_HW3[inside_HW]
+        few = len(hues_N3) // 10
+        if few == 0:
+            continue
+        ends_N3 = hues_N3[hues_N3[:, np.ptp(hues_N3, axis=0).argmax()].argsort()]
+        start_23 = np.stack([ends_N3[:few].mean(0), ends_N3[-few:].mean(0)])
+        if np.ptp(start_23, axis=0).max() <= SAME_HUE:
+            continue
+        means_23, which_N = kmeans2(hues_N3, start_23, minit="matrix")
+        if np.ptp(means_23, axis=0).max() > SAME_HUE and np.bincount(which_N, minlength=2).min() > few:
+            second_HW = inside_HW.copy()
+            second_HW[inside_HW] = which_N == 1
+            nearest = ndimage.distance_transform_edt(~inside_HW, return_distances=False, return_indices=True)
+            found_HW[its_HW & second_HW[tuple(nearest)]] = found_HW.max() + 1
+    return found_HW

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from tests.textocvp.conftest import VOTES
+from tests.textocvp.conftest import VOTES, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from tests.textocvp.training.runs import losses, parser_run, same_weights, train, train_killed_after, weights
+from textocvp.checkpoint import read_config
 from textocvp.data.episodes import EpisodeFile
 from textocvp.presets import PRESETS
 from textocvp.training.light import relight
@@ -60,6 +62,29 @@ def test_mixed_colours_at_a_border_belong_to_what_they_are_mostly() -> None:
     assert np.array_equal(found[27, 4:13] > 0, np.zeros(9, bool))
     assert np.array_equal(found[40, 5:12] == found[38, 10], np.ones(7, bool))
     assert np.array_equal(found[28:40] > 0, labels[0, 28:40] > 0)
+
+
+def test_a_gray_block_that_the_arm_touches_is_no_part_of_it() -> None:
+    frames, labels = painted()
+    touching = np.s_[5, 12:30, 30:34]
+    frames[touching], labels[touching] = DARK, 1
+    found = video_masks(frames, backdrop(frames))[5]
+    assert np.array_equal(found == 1, labels[5] == 1)
+    assert len(np.unique(found[labels[5] == 4])) == 1
+
+
+def test_a_block_of_nearly_its_bowls_hue_is_a_thing_of_its_own() -> None:
+    frames, labels = painted()
+    bowl, block = np.array((120, 125, 140)), np.array((125, 120, 112))
+    frames[:, 30:42, 34:46], labels[:, 28:42, 34:46] = bowl, 0
+    labels[:, 30:42, 34:46] = 4
+    frames[:, 28:30, 34:46] = TABLE
+    frames[:, 33:39, 37:43] = (bowl + block) // 2  # a ring of mixed colours
+    frames[:, 34:38, 38:42], labels[:, 34:38, 38:42] = block, 5
+    found = video_masks(frames[:1], backdrop(frames))[0]
+    its, around = np.unique(found[labels[0] == 5]), np.unique(found[30:32, 34:46])
+    assert len(its) == len(around) == 1 and its != around and its > 1 < around
+    assert np.isin(found[30:42, 34:46], [its, around]).all()
 
 
 @pytest.mark.parametrize("kind", ["video", "masks"])
@@ -132,6 +157,22 @@ def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.Mon
         train(parser_run(folder, "other", preset="tabletop-small", taught=lesson.out / "checkpoint"))
     with pytest.raises(SettingsError, match="has another network"):
         train(replace(taken, out=folder / "wide", set=("parser.channels=8",)))
+
+
+def test_a_whole_model_that_learns_to_see_better_keeps_all_else(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PRESETS, VOTES.name, VOTES)
+    whole = folder / "whole"
+    build(VOTES).save_pretrained(whole)
+    settings = dict(preset=VOTES.name, steps=2, batch=3, clip=1, start=whole)
+    better, redrawn = (parser_run(folder, f"after {n}", first_redraw=n, **settings) for n in (2, 1))
+    for run in (better, redrawn):
+        train(run)
+    before, after = load_file(whole / "model.safetensors"), weights(better.out)
+    assert before.keys() == after.keys()
+    changed = [name for name in before if not torch.equal(before[name], after[name])]
+    assert changed and all(name.startswith("parser.network.") for name in changed)
+    stages = [read_config(run.out / "checkpoint").stage for run in (better, redrawn)]
+    assert stages == ["predictor", "parser"]  # what slots hold has changed, which its predictor does not know
 
 
 def test_on_a_floor_in_uneven_light_shadows_are_floor_and_gray_things_are_not() -> None:
