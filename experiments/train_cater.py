@@ -43,6 +43,7 @@ class Scale:
     draw: tuple[int, int]
     predictor: tuple[int, int]
     polish: tuple[int, int]
+    rows: tuple[int, int]  # of each predictor of the ablation: without text, and with words of each kind
     savi: str  # preset of published slot attention
     stills: tuple[int, int]
     clips: tuple[int, int]
@@ -54,18 +55,18 @@ class Scale:
 
 SCALES = {
     "toy": Scale(
-        train=60, val=16, seen=40, votes=(4, 4), draw=(4, 4), predictor=(6, 4), polish=(2, 4),
+        train=60, val=16, seen=40, votes=(4, 4), draw=(4, 4), predictor=(6, 4), polish=(2, 4), rows=(4, 4),
         savi="savi-cater", stills=(4, 2), clips=(2, 2), savi_predictor=(2, 2), vqvae=(4, 2), mage=(2, 2), evaluate=2,
     ),
     "cpu": Scale(
         train=12000, val=100, seen=3200, votes=(2000, 16), draw=(1200, 16), predictor=(10500, 16),
-        polish=(6000, 16), savi="savi-small", stills=(9500, 16), clips=(0, 0), savi_predictor=(1500, 16),
-        vqvae=(1600, 16), mage=(1000, 8),
+        polish=(6000, 16), rows=(4000, 16), savi="savi-small", stills=(9500, 16), clips=(0, 0),
+        savi_predictor=(1500, 16), vqvae=(1600, 16), mage=(1000, 8),
     ),
     "gpu": Scale(
         train=5000, val=120, seen=5000, votes=(3000, 32), draw=(1500, 16), predictor=(4000, 64),
-        polish=(0, 0), savi="savi-cater", stills=(6000, 64), clips=(1000, 24), savi_predictor=(1500, 32),
-        vqvae=(3000, 32), mage=(2000, 32), evaluate=60,
+        polish=(0, 0), rows=(4000, 64), savi="savi-cater", stills=(6000, 64), clips=(1000, 24),
+        savi_predictor=(1500, 32), vqvae=(3000, 32), mage=(2000, 32), evaluate=60,
     ),
 }  # fmt: skip
 # Ten slots from one Gaussian, as published; the small ones with a wider decoder, and without its Gaussian prior.
@@ -151,6 +152,7 @@ def steps(args: Args) -> list[Step]:
     films = ("--learning-rate", "1e-3", "--autoregressive", "0.33", "--horizon", "8")
     cater = ("--parser", f"{out}/draw/checkpoint", *films)
     words = ("--words-first", str(scale.predictor[0] * 8 // 21))
+    learned = round(scale.rows[0] * 8 / 21)  # updates in which the ablation's words are learned
     plain = ("predictor.appearance=false", "text.kind=transformer")
     color = ("predictor.appearance=false", "predictor.color_bias=true", "text.kind=lexicon")
     savi_parser = "savi-clips" if scale.clips[0] else "savi-stills"
@@ -168,9 +170,11 @@ def steps(args: Args) -> list[Step]:
         train("predictor", "predictor", "slots", scale.predictor, *cater, *words),
         train("polish", "predictor", "predictor slots", scale.polish, "--finetune", "--parser",
               f"{out}/predictor/checkpoint", "--learning-rate", "7e-4", "--autoregressive", "0.6", "--horizon", "12"),
-        train("predictor-plain", "predictor", "slots", scale.predictor, *cater, "--set", *plain),
-        train("predictor-color", "predictor", "slots", scale.predictor, *cater, "--set", *color),
-        train("ocvp-seq", "predictor", "slots", scale.predictor, *cater, "--preset", "ocvp-seq-small", "--set",
+        train("predictor-words", "predictor", "slots", (learned + scale.rows[0], scale.rows[1]), *cater, "--words-first",
+              str(learned)),
+        train("predictor-plain", "predictor", "slots", scale.rows, *cater, "--set", *plain),
+        train("predictor-color", "predictor", "slots", scale.rows, *cater, "--set", *color),
+        train("ocvp-seq", "predictor", "slots", scale.rows, *cater, "--preset", "ocvp-seq-small", "--set",
               "predictor.window=29"),
         # Single frames first: slots bind to things before they follow them.
         train("savi-stills", "parser", "", scale.stills, *savi, *fast, "--clip", "1", "--learning-rate", "4e-4"),
