@@ -37,6 +37,7 @@ from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from textocvp.data.episodes import Episode, EpisodeObject
+from textocvp.pictures import captioned, enlarge
 from textocvp.slots import SlotState
 
 SPLIT = "test"
@@ -195,13 +196,18 @@ class Attention:
         frames, masks = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
         things_1K1 = SlotState.split(rollout.slots[:, 0], rollout.layout).is_thing  # the floor's slot stays dark
         shares_TKW = (rollout.attention[0].double().mean((1, 2)) * things_1K1).cpu().numpy()
-        dark = np.zeros_like(frames)
-        glowing = [
-            [dark if word is None else glow(frames, masks, shares_TKW[..., word]) for word in row]
-            for row in shown_words(model.words(text))
-        ]
+        words, dark, rows = model.words(text), np.zeros_like(frames), []
+        for places in shown_words(words):
+            glowing = [dark if k is None else glow(frames, masks, shares_TKW[..., k]) for k in places]
+            said = ["imagined", *("-" if k is None else words[k] for k in places)]
+            rows.append([labelled(*panel) for panel in zip([frames, *glowing], said, strict=True)])
         panels, name = ("imagined", *COLUMNS), f"cater-attention-{self.scene.seed}.gif"
-        return Clip(name, gif([[frames, *row] for row in glowing]), panels, text, f"seed {self.scene.seed}")
+        return Clip(name, gif(rows, scale=1), panels, text, f"seed {self.scene.seed}")
+
+
+def labelled(frames_THW3: np.ndarray, word: str) -> np.ndarray:
+    """The frames twice as large, with a word below each."""
+    return np.stack([captioned(enlarge(frame, 2), word) for frame in frames_THW3])
 
 
 def shown_words(words: Sequence[str]) -> list[list[int | None]]:

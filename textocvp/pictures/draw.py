@@ -101,8 +101,8 @@ def _screen(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
         factor = max(1, READABLE // pictures.shape[2])
         # Without a text nothing was imagined: the frames are true ones, redrawn from their slots.
         names = ("real", "imagined" if captions[0] else "redrawn", "slots")[-pictures.shape[1] :]
-        panels = [_captioned(_framed(enlarge(p, factor)), n) for p, n in zip(pictures[0], names, strict=True)]
-        return _captioned(_beside(panels), captions[0])
+        panels = [captioned(_framed(enlarge(p, factor)), n) for p, n in zip(pictures[0], names, strict=True)]
+        return captioned(_beside(panels), captions[0])
     columns = [_column(rows, caption) for rows, caption in zip(pictures, captions, strict=True)]
     lines = [columns[i : i + FILM_COLUMNS] for i in range(0, len(columns), FILM_COLUMNS)]
     return _stack([_beside(line) for line in lines])
@@ -113,7 +113,7 @@ def _strip(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
     T = pictures.shape[1]
     moments = np.unique(np.linspace(0, T - 1, min(T, STRIP_MOMENTS)).round().astype(int))
     bands = [
-        _captioned(_beside([_column(sequence[t], f"t = {t}") for t in moments]), caption)
+        captioned(_beside([_column(sequence[t], f"t = {t}") for t in moments]), caption)
         for sequence, caption in zip(pictures, captions, strict=True)
     ]
     return _stack(bands)
@@ -122,7 +122,7 @@ def _strip(pictures: np.ndarray, captions: Sequence[str]) -> np.ndarray:
 def _column(rows: np.ndarray, caption: str) -> np.ndarray:
     """Pictures (rows, H, W, 3) under each other, at half the size of a film of one sequence."""
     factor = max(1, READABLE // 2 // rows.shape[1])
-    return _captioned(np.concatenate([_framed(enlarge(p, factor)) for p in rows], axis=0), caption)
+    return captioned(np.concatenate([_framed(enlarge(p, factor)) for p in rows], axis=0), caption)
 
 
 def _framed(picture: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ def _fill(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.pad(picture, missing, constant_values=PAPER[0])
 
 
-def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+def captioned(picture: np.ndarray, text: str) -> np.ndarray:
     """The picture with its text, if it has one, on a band of paper below."""
     if not text:
         return picture
