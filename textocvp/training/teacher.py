@@ -2,8 +2,9 @@
 
 The camera stands still, so the median of an episode's frames shows the scene without what moves, and its commonest
 colours are those of floor and table. What has none of them is foreground; gray parts of it that reach into the upper
-third are the robot, unless they stand still, and connected parts of one hue are objects. Where no colours are common
-because light falls unevenly on a gray floor (CATER), the floor's light is a smooth surface, and there is no robot.
+third are the robot, but for what the median shows below it, and connected parts of one hue are objects. Where no
+colours are common because light falls unevenly on a gray floor (CATER), the floor's light is a smooth surface, and
+there is no robot.
 """
 
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ MIXED = 0.35  # share of a thing in the colour of a pixel up to which the pixel 
 NOISE = 8.0  # of 255, in each channel: what such a pixel may differ from a mixture of the two
 GRAY = 26  # of 255: difference between channels up to which a pixel is gray
 SAME_HUE = 0.035  # difference of chroma between neighbours up to which they are one thing
+TWO_HUES = 0.025  # and between the halves of a thing from which on it is two
 MIN_PIXELS = 4
 FLAT = 0.6  # share of the picture that the commonest colours must have
 # Of a floor in uneven light: what differs more from it in colour, in 0..255, or is this much darker or lighter.
@@ -187,15 +189,11 @@ def _mostly(
     return mostly_HW
 
 
-def _chroma(frame_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
-    return frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
-
-
 def _parts_of_one_hue(
     frame_HW3: NDArray[np.float32], inside_HW: NDArray[np.bool_], same_hue: float = SAME_HUE
 ) -> NDArray[np.int64]:
     """Connected parts, each with a number above 0."""
-    chroma_HW3 = _chroma(frame_HW3)
+    chroma_HW3 = frame_HW3 / (frame_HW3.sum(-1, keepdims=True) + 30)
     count = int(inside_HW.sum())
     number = np.zeros(inside_HW.shape, int)
     number[inside_HW] = np.arange(count)
@@ -218,7 +216,8 @@ def _parts_of_one_hue(
 
 def _split_by_hue(frame_HW3: NDArray[np.float32], parts_HW: NDArray[np.int64]) -> NDArray[np.int64]:
     """Parts whose inside has two hues are two things: pixels of mixed colours linked a block with its bowl."""
-    chroma_HW3, found_HW = _chroma(frame_HW3), parts_HW.copy()
+    chroma_HW3 = frame_HW3 / frame_HW3.sum(-1, keepdims=True).clip(60)  # the same on lit and on shaded faces
+    found_HW = parts_HW.copy()
     for part in np.unique(parts_HW[parts_HW > 0]):
         its_HW = parts_HW == part
         inside_HW = its_HW & ~_border(its_HW)
@@ -228,10 +227,10 @@ def _split_by_hue(frame_HW3: NDArray[np.float32], parts_HW: NDArray[np.int64]) -
             continue
         ends_N3 = hues_N3[hues_N3[:, np.ptp(hues_N3, axis=0).argmax()].argsort()]
         start_23 = np.stack([ends_N3[:few].mean(0), ends_N3[-few:].mean(0)])
-        if np.ptp(start_23, axis=0).max() <= SAME_HUE:
+        if np.ptp(start_23, axis=0).max() <= TWO_HUES:
             continue
         means_23, which_N = kmeans2(hues_N3, start_23, minit="matrix")
-        if np.ptp(means_23, axis=0).max() > SAME_HUE and np.bincount(which_N, minlength=2).min() > few:
+        if np.ptp(means_23, axis=0).max() > TWO_HUES and np.bincount(which_N, minlength=2).min() > few:
             second_HW = inside_HW.copy()
             second_HW[inside_HW] = which_N == 1
             nearest = ndimage.distance_transform_edt(~inside_HW, return_distances=False, return_indices=True)

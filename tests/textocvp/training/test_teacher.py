@@ -87,6 +87,13 @@ def test_a_block_of_nearly_its_bowls_hue_is_a_thing_of_its_own() -> None:
     assert np.isin(found[30:42, 34:46], [its, around]).all()
 
 
+def test_a_block_with_a_face_in_shade_is_one_thing() -> None:
+    frames, _ = painted()
+    frames[:, 28:34, 34:40], frames[:, 34:40, 34:40] = (66, 123, 46), (39, 71, 27)  # as in an episode of `varied`
+    found = video_masks(frames[:1], backdrop(frames))[0]
+    assert len(np.unique(found[28:40, 34:40])) == 1 and found[30, 36] > 1
+
+
 @pytest.mark.parametrize("kind", ["video", "masks"])
 def test_labels_are_those_of_the_clips_frames(tmp_path: Path, kind: str) -> None:
     with EpisodeFile(write_toy_episodes(tmp_path / "toy.h5", [9, 8])) as episodes:
