@@ -81,8 +81,8 @@ SAVI = {
 class Args:
     """Make the clips of CATER-hard and train every model on them."""
 
-    out: Path = Path("runs/cater")
-    """Folder of all of it."""
+    out: Path | None = None
+    """Folder of all of it; runs/cater, or runs/cater-SCALE at another scale."""
     scale: Literal["toy", "cpu", "gpu"] = "cpu"
     """How much: a few updates, what two cores do in a night, or what a GPU does in minutes."""
     jobs: int = 1
@@ -100,6 +100,11 @@ class Args:
     list: bool = False
     """Print the commands and run none."""
 
+    @property
+    def folder(self) -> Path:
+        """Where all of it is."""
+        return self.out or Path("runs/cater" if self.scale == "cpu" else f"runs/cater-{self.scale}")
+
 
 @dataclass(frozen=True)
 class Step:
@@ -111,18 +116,27 @@ class Step:
     updates: int | None = None  # of a training
     needs: tuple[str, ...] = ()
     slots: Path | None = None  # where the slots of all clips are, for a run that learns from them
+    clips: int = 0  # of a collection, which leaves a file of fewer when it is stopped
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has run to its end."""
+        if not (self.done.exists() and self.clips):
+            return self.done.exists()
+        with open_episodes(self.done) as episodes:
+            return len(episodes) >= self.clips
 
 
 def steps(args: Args) -> list[Step]:
     """All of them, in an order in which they can run."""
-    out, scale = args.out, SCALES[args.scale]
+    out, scale = args.folder, SCALES[args.scale]
     data = ("--data", f"{out}/train.h5", "--val", f"{out}/val.h5")
 
     def collect(split: str, episodes: int) -> Step:
         path = out / f"{split}.h5"
         options = ("--world", "cater", "--split", split, "--episodes", str(episodes), "--out", str(path))
         workers = ("--workers", str(args.workers if split == "train" else 2))
-        return Step(split, (args.collector, "-m", "envs.collect", *options, *workers), path)
+        return Step(split, (args.collector, "-m", "envs.collect", *options, *workers), path, clips=episodes)
 
     def train(name: str, kind: str, needs: str, size: tuple[int, int], *options: str) -> Step:
         sizes = ("--steps", str(size[0]), "--batch", str(size[1]), "--seed", str(args.seed))
@@ -198,10 +212,10 @@ def main(args: Args) -> int:
     chosen = wanted(steps(args), args.only)
     if args.list:
         for step in chosen:
-            print(f"# {step.name}{' (done)' if step.done.exists() else ''}\n{shlex.join(step.command)}")
+            print(f"# {step.name}{' (done)' if step.is_done else ''}\n{shlex.join(step.command)}")
         return 0
-    args.out.mkdir(parents=True, exist_ok=True)
-    states = {step.name: "done" if step.done.exists() else "waits" for step in chosen}
+    args.folder.mkdir(parents=True, exist_ok=True)
+    states = {step.name: "done" if step.is_done else "waits" for step in chosen}
     began, running = time.monotonic(), dict[Future[bool], Step]()
     with ThreadPoolExecutor(args.jobs) as pool:
         while True:
@@ -211,7 +225,7 @@ def main(args: Args) -> int:
                 ready = states[step.name] == "waits" and all(states[one] == "done" for one in step.needs)
                 if ready and len(running) < args.jobs:
                     states[step.name] = "runs"
-                    running[pool.submit(run, step, args.out)] = step
+                    running[pool.submit(run, step, args.folder)] = step
                     print(f"{time.monotonic() - began:6.0f} s  {step.name} begins", flush=True)
             if not running:
                 break
@@ -247,14 +261,14 @@ def run(step: Step, out: Path) -> bool:
                 (folder / name).symlink_to((step.slots / name).absolute())
     with open(out / f"{step.name}.log", "ab") as log:
         ended = subprocess.run(step.command, stdout=log, stderr=log, check=False).returncode
-    return ended == 0 and step.done.exists()
+    return ended == 0 and step.is_done
 
 
 def parse(args: Args, checkpoint: Path, folder: Path) -> None:
     """Write the slots of all clips, with several processes: a parser that looks at pixels one by one is slow."""
     for name, file in SLOTS.items():
         jobs = (
-            delayed(_parse)(checkpoint, args.out / file, folder / name, i, args.workers) for i in range(args.workers)
+            delayed(_parse)(checkpoint, args.folder / file, folder / name, i, args.workers) for i in range(args.workers)
         )
         Parallel(n_jobs=args.workers)(jobs)
     (folder / DONE).touch()

@@ -88,8 +88,8 @@ def _meant(name: str, things: tuple[Thing, ...]) -> list[int]:
 
 def _area(said: str) -> Area:
     """Where a cell or a quadrant is."""
-    if (cell := CELL.fullmatch(said)) and 0 not in (ns := (int(cell[1]), int(cell[2]))):
-        x, y = ((n - 1.0, float(n)) if n > 0 else (float(n), n + 1.0) for n in ns)
+    if cell := CELL.fullmatch(said):
+        x, y = ((n - 1.0, float(n)) if n > 0 else (float(n), n + 1.0) for n in map(int, cell.groups()))
         return x, y
     signs = QUADRANTS.get(said.removeprefix("the ").removesuffix(" quadrant"))
     if signs is None:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..dataset import ARRAYS, TEXT, Arrays, Columns, World, versions
+from ..physics.camera import Camera
 from ..splits import SPLITS
 from .scenes import ACTIONS, COLORS, FRAMES, MATERIALS, SIZES, Clip, draw_clip
-from .world import Table
+from .world import CAMERA, OVERSAMPLING, Table
 
 Captions = Literal["explicit", "ambiguous"]
 LABELS = {"background": 0}  # thing i has the label 1 + i
@@ -75,7 +76,7 @@ class CaterConfig(World):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        camera = Table(self.image_size).camera
+        camera = Camera(CAMERA, self.image_size, OVERSAMPLING)
         numbers = [str(n) for n in (-3, -2, -1, 1, 2, 3)]
         vocabulary = [*WORDS.split(), *SIZES, *MATERIALS, *COLORS, *ACTIONS, *numbers]
         return {

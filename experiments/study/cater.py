@@ -1,11 +1,11 @@
 """What CATER's scenes are for a study, and how an imagined clip is judged: from masks, by the simulator's rules."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 
-from envs.cater import Act, Action, Clip, Table, Thing, cell, draw_acts
+from envs.cater import Act, Action, Clip, Table, Thing, draw_acts
 from envs.cater.record import clip_of
 from envs.cater.scenes import CONTAINED, LIFT
 from envs.splits import SPLITS
@@ -20,6 +20,8 @@ NEAR = 4.0  # pixels between a cone and what it was put over
 VANISHED = 0.4  # share of its pixels that a contained thing shows at most
 COVERED = 0.3  # IoU of a slot with the thing that it holds, at least
 TRIES = 20  # to find other actions for a scene
+SIDE = 64  # pixels of a picture's side
+FAR = 8.0  # of them: a slide that nobody can overlook
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,19 @@ def cater_scenes(count: int, seed: int, split: str = "test") -> list[CaterScene]
     return [CaterScene(split, SPLITS[split].seed(first + i)) for i in range(count)]
 
 
+def slide_away(things: tuple[Thing, ...]) -> tuple[Act, ...] | None:
+    """Actions in which the first thing slides further than `FAR` in the picture, and another one acts."""
+    rng = np.random.default_rng([len(things), 6])
+    for _ in range(TRIES):
+        acts = draw_acts(rng, things, first=(0, "slide"))
+        if acts is None or acts[0].to is None:
+            return None
+        start, end = (in_picture(place, things[0].height, SIDE) for place in (things[0].place, acts[0].to))
+        if np.linalg.norm(end - start) > FAR:
+            return acts
+    return None
+
+
 def slots_of_things(rollout: Rollout, first_HW: np.ndarray) -> dict[int, int]:
     """Thing -> the slot (B = 1) whose mask covers it in the first frame, by the simulator's labels of that frame."""
     labels_HW = rollout.decode_masks([0])[0, 0].argmax(0).cpu().numpy()
@@ -76,7 +91,8 @@ class Judged:
     """One action as it was imagined; None where nothing can be said of it."""
 
     object: bool | None  # the named thing is among those that move farthest
-    action: bool | None  # what it does is what the caption says
+    action: bool | None  # what it does is what the caption says; a turn cannot be told from its mask
+    rests: bool | None  # what is told to turn stays where it is
     place: bool | None  # it ends in the named cell or next to it
     vanishes: bool | None  # what is contained is no longer seen
 
@@ -88,12 +104,21 @@ class Judged:
 def judge(labels_THW: np.ndarray, clip: Clip, first_HW: np.ndarray) -> list[Judged]:
     """What masks (T, H, W) show of the actions of a clip.
 
+    Where both acting things have one name, each may do the other's part: the better of the two readings counts.
+
     Args:
         labels_THW: the slot of each pixel, frame 0 first.
         first_HW: the simulator's labels of frame 0, by which slots get their things.
     """
-    size = first_HW.shape[0]
-    ways = paths(labels_THW, clip, first_HW)
+    ways, readings = paths(labels_THW, clip, first_HW), [clip.acts]
+    who = [act.thing for act in clip.acts]
+    if len({clip.things[k].name for k in who}) < len(who):
+        readings.append(tuple(replace(act, thing=k) for act, k in zip(clip.acts, who[::-1], strict=True)))
+    judged = [_judged(ways, Clip(clip.things, acts), first_HW.shape[0]) for acts in readings]
+    return max(judged, key=lambda found: sum(value is True for one in found for value in vars(one).values()))
+
+
+def _judged(ways: dict[int, "Path"], clip: Clip, size: int) -> list[Judged]:
     far = {k: float(np.linalg.norm(way.end - way.start)) for k, way in ways.items()}
     moving = [act for act in clip.acts if act.to is not None]
     farthest = sorted(far, key=lambda k: -far[k])[: len(moving)]
@@ -105,10 +130,12 @@ def judge(labels_THW: np.ndarray, clip: Clip, first_HW: np.ndarray) -> list[Judg
         place = None
         if act.to is not None:
             place = way is not None and _next_to(_place(way, clip.things[who], size), act.to)
+        turns = act.action == "rotate"
         found.append(
             Judged(
                 None if act.to is None else who in farthest and far[who] > MOVED,
-                did == act.action,
+                None if turns else did == act.action,
+                did == "rotate" if turns else None,
                 place,
                 None if act.into is None else act.into in ways and ways[act.into].left <= VANISHED,
             )
@@ -163,8 +190,8 @@ def _did(who: int, way: Path, clip: Clip, ways: dict[int, Path], size: int) -> A
     thing, T = clip.things[who], len(way.points_T2)
     share_T = np.linspace(0, 1, T)
     line_y = way.start[1] + share_T * (way.end[1] - way.start[1])
-    up = float(np.nanmax(np.minimum(line_y, max(way.start[1], way.end[1])) - way.points_T2[:, 1]))
-    high, low = (_camera(size).project(np.array([[*thing.place, z]]))[0] for z in (thing.height + LIFT, thing.height))
+    up = float(np.nanmax(line_y - way.points_T2[:, 1]))
+    high, low = (in_picture(thing.place, z, size) for z in (thing.height + LIFT, thing.height))
     if up < LIFTED * (low[1] - high[1]):
         return "slide" if np.linalg.norm(way.end - way.start) > MOVED else "rotate"
     for k, other in enumerate(clip.things):
@@ -174,6 +201,11 @@ def _did(who: int, way: Path, clip: Clip, ways: dict[int, Path], size: int) -> A
         if np.linalg.norm(ways[k].start - way.end) <= NEAR + size * 0.02 * thing.radius:
             return "contain"
     return "pick-place"
+
+
+def in_picture(place: tuple[float, float], height: float, size: int) -> np.ndarray:
+    """Where a point above a place of the table is seen, (x, y) in pixels of a picture of so many a side."""
+    return np.asarray(_camera(size).project(np.array([[*place, height]]))[0])
 
 
 @lru_cache(maxsize=2)
@@ -190,6 +222,6 @@ def _place(way: Path, thing: Thing, size: int) -> np.ndarray:
 
 
 def _next_to(place: np.ndarray, to: tuple[float, float]) -> bool:
-    """Whether a place lies in the cell of another, or in one that touches it."""
-    numbers = [[n + 3 if n < 0 else n + 2 for n in cell((float(x), float(y)))] for x, y in (place, to)]
-    return all(abs(a - b) <= 1 for a, b in zip(*numbers, strict=True))
+    """Whether a place lies in the cell of another, or in one that touches it, be it off the table."""
+    cells = np.ceil(np.array([place, to]))
+    return bool((np.abs(cells[0] - cells[1]) <= 1).all())

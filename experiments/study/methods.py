@@ -143,6 +143,12 @@ METHODS: dict[str, Method] = {
                note="the same, but slots are named by the simulator's segmentation"),
         Method(key="savi", hue=7, note="published slot attention from pixels, and text", model="savi-cater-trained",
                train="python experiments/train_cater.py --only savi"),
+        Method(key="ours, few updates", hue=0, note="CATER: the predictor had 4,000 updates, as those below",
+               model="cater-words", train="python experiments/train_cater.py --only predictor-words"),
+        Method(key="plain attention", hue=7, note="the same, without a term that matches words and slots",
+               model="cater-plain", train="python experiments/train_cater.py --only predictor-plain"),
+        Method(key="colour lexicon", hue=7, note="the same, with the term that matches colours alone",
+               model="cater-color", train="python experiments/train_cater.py --only predictor-color"),
         Method(key="OCVP-Seq", kind="baseline", hue=5, note="slots, but no text", model="ocvp-seq-small",
                train=f"{_TRAIN_PREDICTOR} --preset ocvp-seq-small {_DATA} --out runs/ocvp-seq --steps 1500 "
                "--autoregressive 1.0"),

@@ -11,7 +11,7 @@ import pytest
 from envs.cater import Act, Clip, Thing
 from experiments.cater import STUDY, Args, Sizes, shown_words
 from experiments.report.results import Results
-from experiments.study.cater import CaterScene, cater_scenes, judge
+from experiments.study.cater import CaterScene, _next_to, cater_scenes, judge
 from experiments.study.frame_metrics import Measures
 from experiments.study.run import run
 from experiments.train_cater import Args as TrainArgs
@@ -44,7 +44,8 @@ ACTS = {
 def test_what_really_happens_is_right(name) -> None:
     clip, labels = shown(ACTS[name])
     for act, one in zip(clip.acts, judge(labels, clip, labels[0]), strict=True):
-        assert one.action
+        assert one.action is (None if act.action == "rotate" else True)
+        assert one.rests is (True if act.action == "rotate" else None)
         assert one.object is (None if act.to is None else True)
         assert one.place is (None if act.to is None else True)
         assert one.vanishes is (None if act.into is None else True)
@@ -79,8 +80,12 @@ def test_what_the_simulator_does_not_show_is_not_asked() -> None:
     slid, lifted = judge(labels, clip, labels[0])
     assert (slid.object, slid.action, slid.place) == (False, False, True)
     still = judge(np.repeat(labels[:1], len(labels), 0), clip, labels[0])
-    assert vars(still[0].where(slid)) == {"object": None, "action": None, "place": True, "vanishes": None}
-    assert vars(still[1].where(lifted)) == {"object": False, "action": False, "place": False, "vanishes": None}
+    assert vars(still[0].where(slid)) == {
+        "object": None, "action": None, "rests": None, "place": True, "vanishes": None,
+    }  # fmt: skip
+    assert vars(still[1].where(lifted)) == {
+        "object": False, "action": False, "rests": None, "place": False, "vanishes": None,
+    }  # fmt: skip
 
 
 def test_slots_may_have_any_numbers_and_of_two_alike_either_may_act() -> None:
@@ -95,6 +100,27 @@ def test_slots_may_have_any_numbers_and_of_two_alike_either_may_act() -> None:
     _, other = shown((Act(2, "slide", 0, 25, (-1.5, -1.5)), Act(1, "rotate", 0, 25)), things)
     found = judge(other, asked, other[0])[0]
     assert (found.object, found.action, found.place) == (True, True, True)
+    # Where both act, each may do the other's part; but not both the same.
+    slide, put = Act(0, "slide", 0, 25, (-1.5, -1.5)), Act(2, "pick-place", 0, 25, (0.5, -0.5))
+    both = Clip(things, (slide, put))
+    _, swapped = shown((replace(slide, thing=2), replace(put, thing=0)), things)
+    _, twice = shown((slide, replace(slide, thing=2, to=(0.5, -0.5))), things)
+    for labels, right in ((swapped, [True, True]), (twice, [True, False])):
+        assert [one.action for one in judge(labels, both, labels[0])] == right
+
+
+def test_what_turns_must_stay_and_shows_nothing_else() -> None:
+    asked, labels = shown((Act(1, "slide", 0, 25, (2.5, -1.5)), Act(2, "rotate", 0, 25)))
+    _, moved = shown((Act(1, "slide", 0, 25, (2.5, -1.5)), Act(2, "slide", 0, 25, (-1.5, -2.5))))
+    turned, slid = (judge(its, asked, its[0])[1] for its in (labels, moved))
+    assert vars(turned) == {"object": None, "action": None, "rests": True, "place": None, "vanishes": None}
+    assert slid.rests is False
+
+
+@pytest.mark.parametrize(("off", "right"), [((2.9, 2.9), True), ((3.5, 3.5), True), ((9, 9), False), ((-9, -9), False)])
+def test_a_place_off_the_table_is_next_to_its_border_alone(off, right) -> None:
+    edge = (2.5, 2.5) if off[0] > 0 else (-2.5, -2.5)
+    assert _next_to(np.array(off, float), edge) is right
 
 
 def test_a_scene_under_other_captions_has_the_same_things() -> None:
@@ -147,6 +173,7 @@ def test_training_is_commands_in_an_order_in_which_they_can_run(tmp_path, capsys
         wanted(found, ["nothing"])
     assert main(replace(args, list=True, only=("val",))) == 0
     listed = capsys.readouterr().out
+    assert TrainArgs(scale="toy").folder != TrainArgs().folder
     assert "--world cater --split val" in listed and "train parser" not in listed
     assert not (tmp_path / "val.h5").exists()
     assert main(replace(args, only=("val",), collector="/bin/false")) == 1  # a step that fails is told

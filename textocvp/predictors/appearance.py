@@ -2,10 +2,10 @@
 
 A caption of CATER names things by size, colour, material and shape, and where there are two alike it may mean either.
 Every name is matched with what each slot looks like in the first frame. How surely a word names a slot that acts is
-learned, too. Together they say which slots act, which the
-training clips show: those that move, turn, or are reached by one that moves (a noisy-or over the words, as in learning
-from bags of instances, Maron and Lozano-Perez 1998). While the predictor trains, it is told which slots acted, so that
-a sentence that fits two things does not teach it to move both by half.
+learned, too. Together they say which slots act, which the training clips show: those that move, or are reached by one
+that moves; what merely turns counts neither for nor against (a noisy-or over the words, as in learning from bags of
+instances, Maron and Lozano-Perez 1998). While the predictor trains, it is told which slots acted, so that a sentence
+that fits two things does not teach it to move both by half.
 """
 
 import torch
