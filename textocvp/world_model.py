@@ -124,7 +124,7 @@ class WorldModel:
         """
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
-            warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=2)
+            warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=3)
         return self._imagined(self.model.predictor, obs, text, horizon, seed, num_slots, attention)
 
     @property
@@ -236,7 +236,7 @@ class WorldModel:
         Raises:
             TypeError, ValueError: as `rollout`.
         """
-        (text,) = checked_texts(text, self.model.text)
+        (text,) = checked_texts(text, self.model.text, depth=2)
         return self.model.text.reads(text)
 
     def _parsed(self, frames_BT3HW: Tensor, seed: int, num_slots: int | None) -> Rollout:
@@ -276,8 +276,12 @@ class WorldModel:
     def _put_right(self, frames_BT3HW: Tensor, depth: int) -> Tensor:
         """Videos in the light of the model's own world; a `ForeignPictureWarning` where that had to be changed."""
         own = self.model.config.own_frames
-        if own is None or frames_BT3HW.shape[-2:] != self.image_size:
+        if own is None:
             return frames_BT3HW
+        if frames_BT3HW.shape[-2:] != self.image_size:
+            if self.model.renderer.keeps_size:
+                return frames_BT3HW
+            frames_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
         frames_BT3HW, done = put_right(frames_BT3HW, own, self.model.restorer)
         if done:
             said = f"the picture does not look like those that this model was trained on: it is {', and '.join(done)}"

@@ -59,6 +59,8 @@ class VotesConfig(CropConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_slots(3, "background, robot and a thing")
+        if self.image_size % 2:
+            raise ValueError(f"parser.image_size is {self.image_size}: the network reads squares of 2x2 pixels")
 
 
 class Residual(nn.Module):
@@ -289,6 +291,8 @@ class VotesParser(SceneParser):
 
         No gradient reaches the network, which learns from `vote_loss`. What is expected of a slot is what it was.
         """
+        if num_slots is not None and num_slots < FIRST_THING:
+            raise ValueError(f"num_slots is {num_slots}: background and robot take {FIRST_THING}")
         state = self._nothing(frames_BT3HW[:, 0], num_slots or self.config.num_slots)
         speed_BK2 = torch.zeros_like(state.position)
         slots, attentions = [], []

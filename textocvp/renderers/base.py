@@ -48,6 +48,7 @@ class Renderer(nn.Module):
     """
 
     Config: ClassVar[type[RendererConfig]]
+    keeps_size: ClassVar[bool] = False  # whether it draws at the size of first frames that are larger than the model's
 
     @abstractmethod
     def forward(self, slots_BKD: Tensor) -> Rendered:

@@ -69,6 +69,7 @@ class CarryRenderer(GlimpseRenderer):
     """
 
     Config = CarryConfig
+    keeps_size = True
 
     def __init__(self, config: CarryConfig, layout: SlotLayout, image_size: int) -> None:
         super().__init__(config, layout, image_size)

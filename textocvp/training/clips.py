@@ -100,9 +100,23 @@ def clip_reader(
     """A reader of this process's clips; with `args.cache_features` the features of all episodes are computed first.
 
     Raises:
-        SettingsError: if no episode is long enough for a clip, or there is no frozen encoder to cache features of.
-        WeightsError: if its weights are missing.
+        WeightsError: if the encoder's weights are missing.
         CacheError: if `args.out` holds features of another encoder or of other episodes.
+    """
+    features = None
+    if args.cache_features:
+        assert encoder is not None  # `check_clips` saw to it
+        share = (run.accelerator.process_index, run.accelerator.num_processes)
+        features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)
+        run.accelerator.wait_for_everyone()
+    return ClipReader(episodes, args, run.rows, features, teacher)
+
+
+def check_clips(args: ClipTraining, episodes: Episodes, encoder: FrozenEncoder | None) -> None:
+    """What a `clip_reader` needs, before a run begins.
+
+    Raises:
+        SettingsError: if no episode is long enough for a clip, or there is no frozen encoder to cache features of.
     """
     longest, wanted = int(episodes.lengths.max()), (args.clip - 1) * args.stride + 1
     if wanted > longest:
@@ -110,16 +124,10 @@ def clip_reader(
             f"clip={args.clip} and stride={args.stride} need episodes of {wanted} frames, the longest of "
             f"{args.data} has {longest}"
         )
-    features = None
-    if args.cache_features:
-        if encoder is None:
-            raise SettingsError(
-                "cache_features needs a frozen image encoder: set parser.encoder (or vqvae.encoder) to dinov2"
-            )
-        share = (run.accelerator.process_index, run.accelerator.num_processes)
-        features = cached_features(encoder, episodes, args.out / "features-train", *share, device=run.device)
-        run.accelerator.wait_for_everyone()
-    return ClipReader(episodes, args, run.rows, features, teacher)
+    if args.cache_features and encoder is None:
+        raise SettingsError(
+            "cache_features needs a frozen image encoder: set parser.encoder (or vqvae.encoder) to dinov2"
+        )
 
 
 def save_samples(

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from textocvp.config import MOST
 from textocvp.data.episodes import Episodes
 from textocvp.inputs import DARK, HUE_REACH, HUE_SHARE, LEARNT_DB, OwnFrames, are_gray, canvas, hue_shares
 from textocvp.metrics import Interval, bootstrap_interval, followed, foreground_ari, object_ious, psnr
@@ -142,7 +143,7 @@ def measure_own_frames(model: TextOCVP, episodes: Episodes) -> OwnFrames:
     canvas_E3, grain_high = torch.cat(canvases), torch.cat(grains).quantile(0.99).item()
     same = bool((canvas_E3 == canvas_E3[0]).all())
     its = bytes(canvas_E3[0].int().tolist()).hex() if same else ""
-    return OwnFrames(len(psnr_E), round(mean, 2), round(low, 2), hue, gray, its, round(grain_high, 3))
+    return OwnFrames(min(len(psnr_E), MOST), round(mean, 2), round(low, 2), hue, gray, its, round(grain_high, 3))
 
 
 def _hues(values_3HW: Tensor, most: int = 64) -> Tensor:

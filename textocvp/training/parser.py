@@ -25,7 +25,7 @@ from textocvp.parsers.votes import VotesParser
 from textocvp.pictures import color_masks
 from textocvp.presets import preset
 from textocvp.slots import SlotState
-from textocvp.training.clips import ClipTraining, clip_reader, save_samples, to_pictures
+from textocvp.training.clips import ClipTraining, check_clips, clip_reader, save_samples, to_pictures
 from textocvp.training.evaluate_parser import ParserMetrics, measure_own_frames, measure_parser
 from textocvp.training.losses import ParserLoss, image_loss, mask_loss, place_loss, read_place_loss, thing_weights
 from textocvp.training.run import Run, SettingsError, allowed_settings, close_run, open_data, open_run
@@ -51,9 +51,10 @@ class ParserTraining(ClipTraining):
     renderer, are trained."""
 
     start: Path | None = None
-    """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips. With
-    `first_redraw` not before `steps` its parser only learns to see better, and all else of the checkpoint stays as it
-    is, its predictor, too."""
+    """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips."""
+    keep_rest: bool = False
+    """Only the network of a parser that is taught goes on learning to see; all else of `start` stays, its predictor,
+    too."""
 
 
 class ParserStage(nn.Module):
@@ -122,26 +123,28 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
     # On single frames the transition takes no part, and before the first redraw nothing but the lesson.
-    some_unused = args.clip == 1 or args.first_redraw > 0
+    some_unused = args.clip == 1 or args.first_redraw > 0 or args.keep_rest
     accelerator = open_run(args.out, args.precision, some_unused=some_unused)
     torch.manual_seed(args.seed)
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
         model = TextOCVP(config)
+    learns = model.parser.taught and args.taught is None
+    check_lesson(args, learns)
     if args.start is not None:
-        model = go_on_from(model, args.start, whole=model.parser.taught and args.first_redraw >= args.steps)
+        model = go_on_from(model, args.start, args.keep_rest)
     if args.taught is not None:
         keep_taught(model, args.taught)
     model.to(accelerator.device)
-    run = Run(args, accelerator, ParserStage(model))
     with open_data(args, model.config.parser.image_size, "parser.image_size") as (episodes, held_out):
+        check_clips(args, episodes, model.parser.frozen)
+        if learns and args.teacher == "masks" and ((truth := episodes.truth(0)) is None or truth.segmentation is None):
+            raise SettingsError(f"{args.data} has no masks to teach with: leave out --teacher masks")
+        run = Run(args, accelerator, ParserStage(model))
 
         def measure(count: int | None) -> ParserMetrics:
             return measure_parser(model, held_out, range(len(held_out))[:count])
 
-        if args.first_redraw and not model.parser.taught:
-            raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes")
-        learns = model.parser.taught and args.taught is None
         teacher = Teacher(args.teacher, episodes) if learns else None
         reader = clip_reader(run, args, episodes, model.parser.frozen, teacher)
         for step, clips in reader.steps(run, "parser"):
@@ -159,7 +162,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                     generator=generators,
                     features_BTLF=None if features_BTLF is None else features_BTLF[part],
                     lesson=None if lesson is None else (lesson[0][part], lesson[1][part]),
-                    redraw=step >= args.first_redraw,
+                    redraw=step >= args.first_redraw and not args.keep_rest,
                 )
                 run.backward(loss.total(), vars(loss))
             run.update(step)
@@ -176,6 +179,14 @@ def train(args: ParserTraining) -> ParserMetrics | None:
     return metrics
 
 
+def check_lesson(args: ParserTraining, learns: bool) -> None:
+    """Raise a SettingsError where what a parser is to be taught does not go together."""
+    if args.first_redraw and not learns:
+        raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes and leave out taught")
+    if args.keep_rest and (args.start is None or not learns):
+        raise SettingsError("keep_rest is for parsers that are taught: name a checkpoint of one with --start")
+
+
 def go_on_from(model: TextOCVP, checkpoint: Path, whole: bool) -> TextOCVP:
     """The model with parser and renderer of a checkpoint, or that checkpoint as a whole.
 
@@ -183,7 +194,11 @@ def go_on_from(model: TextOCVP, checkpoint: Path, whole: bool) -> TextOCVP:
         SettingsError: if the checkpoint was built otherwise.
     """
     source = TextOCVP.from_pretrained(str(checkpoint)).train()
-    if (source.config.parser, source.config.renderer) != (model.config.parser, model.config.renderer):
+    parser, encoder = model.config.parser, model.parser.frozen
+    if encoder is not None and source.parser.frozen is not None and not encoder.fingerprint:
+        encoder.fingerprint = source.parser.frozen.fingerprint  # the same weights, or an error when they are read
+        parser = replace(parser, encoder_fingerprint=encoder.fingerprint)  # type: ignore[call-arg]
+    if (source.config.parser, source.config.renderer) != (parser, model.config.renderer):
         raise SettingsError(f"{checkpoint} is built otherwise: give the same preset and set as it was trained with")
     if whole:
         return source

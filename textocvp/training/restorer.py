@@ -79,8 +79,8 @@ def train(args: RestorerTraining) -> RestorerMetrics | None:
         assert model.config.restorer is not None
         model.restorer = Restorer(model.config.restorer)
     model.to(accelerator.device)
-    run = Run(args, accelerator, model.restorer)
     with open_data(args, model.config.parser.image_size, "parser.image_size") as (episodes, held_out):
+        run = Run(args, accelerator, model.restorer)
         measured = partial(measure, model.restorer, held_out)
         for step in run.steps("restorer"):
             rng = step_rng(args.seed, step)

@@ -78,8 +78,11 @@ class Teacher:
         truth = self.episodes.truth(index)
         if truth is None or truth.segmentation is None:
             raise ValueError(f"{self.episodes.path} has no masks to teach with: use --teacher video")
-        robot, labels = truth.segmentation == truth.robot, truth.segmentation
-        return np.where(robot, 1, labels + ((labels > 0) & (truth.robot != 1))).astype(np.uint8)
+        labels = truth.segmentation.copy()
+        if truth.robot != 1:  # that label is the robot's here
+            labels[labels == 1] = np.setdiff1d(np.arange(2, 256), labels)[0]
+        labels[truth.segmentation == truth.robot] = 1
+        return labels
 
 
 def backdrop(frames_THW3: NDArray[np.uint8]) -> Backdrop:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from tests.textocvp.conftest import VOTES, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from tests.textocvp.training.runs import losses, parser_run, same_weights, train, train_killed_after, weights
 from textocvp.checkpoint import read_config
-from textocvp.data.episodes import EpisodeFile
+from textocvp.data.episodes import EpisodeFile, Episodes, Truth
 from textocvp.presets import PRESETS
 from textocvp.training.light import relight
+from textocvp.training.parser import ParserTraining
 from textocvp.training.run import SettingsError
 from textocvp.training.teacher import Teacher, backdrop, video_masks
 
@@ -138,14 +140,36 @@ def test_a_killed_run_continues_exactly(folder: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_renderer_waits_only_for_a_parser_that_is_taught(folder: Path) -> None:
-    with pytest.raises(SettingsError, match="first_redraw is for parsers that are taught"):
-        train(parser_run(folder, "out", first_redraw=2))
+    """And what cannot be done is known before `fresh` throws a run away."""
+    done = parser_run(folder, "done", steps=1)
+    train(done)
+    before = weights(done.out)
+    for changes, said in (
+        ({"first_redraw": 2}, "first_redraw is for parsers that are taught"),
+        ({"keep_rest": True}, "keep_rest is for parsers that are taught"),
+        ({"clip": 50}, "need episodes of"),
+        ({"cache_features": True}, "needs a frozen image encoder"),
+    ):
+        with pytest.raises(SettingsError, match=said):
+            train(replace(done, fresh=True, **changes))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in weights(done.out).items())
 
 
 def test_a_teacher_without_masks_says_so(tmp_path: Path) -> None:
     path = write_toy_episodes(tmp_path / "toy.h5", [9], truth=False)
     with EpisodeFile(path) as episodes, pytest.raises(ValueError, match="has no masks to teach with"):
         Teacher("masks", episodes).labels(np.array([0]), episodes.clips(np.array([0]), 1), 1)
+    run = ParserTraining(path, path, tmp_path / "out", preset="cater", set=("parser.image_size=32",), clip=1)
+    with pytest.raises(SettingsError, match="has no masks to teach with: leave out --teacher masks"):
+        train(replace(run, teacher="masks"))
+
+
+def test_every_label_teaches_a_thing_of_its_own() -> None:
+    class Labelled:
+        truth = staticmethod(lambda index: Truth(segmentation=np.array([[[0, 1, 2], [254, 255, 255]]], np.uint8)))
+
+    given = Teacher("masks", cast(Episodes, Labelled()))._given(0)
+    assert given[0, 0, 0] == 0 and len(np.unique(given)) == 5 and not (given == 1).any()
 
 
 def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,9 +195,12 @@ def test_a_whole_model_that_learns_to_see_better_keeps_all_else(folder: Path, mo
     whole = folder / "whole"
     build(VOTES).save_pretrained(whole)
     settings = dict(preset=VOTES.name, steps=2, batch=3, clip=1, start=whole)
-    better, redrawn = (parser_run(folder, f"after {n}", first_redraw=n, **settings) for n in (2, 1))
+    better, redrawn = (parser_run(folder, f"kept: {keep}", keep_rest=keep, **settings) for keep in (True, False))
     for run in (better, redrawn):
         train(run)
+    train(replace(better, steps=3))
+    with pytest.raises(SettingsError, match="holds a run with keep-rest True, not False"):
+        train(replace(better, keep_rest=False, steps=4))
     before, after = load_file(whole / "model.safetensors"), weights(better.out)
     assert before.keys() == after.keys()
     changed = [name for name in before if not torch.equal(before[name], after[name])]

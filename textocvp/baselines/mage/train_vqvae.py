@@ -21,7 +21,7 @@ from textocvp.config import with_settings
 from textocvp.data.episodes import Episodes
 from textocvp.metrics import psnr
 from textocvp.parsers.base import to_frames
-from textocvp.training.clips import Clips, ClipTraining, clip_reader, save_samples, to_pictures
+from textocvp.training.clips import Clips, ClipTraining, check_clips, clip_reader, save_samples, to_pictures
 from textocvp.training.losses import thing_weights
 from textocvp.training.run import Metrics, Run, allowed_settings, close_run, open_data, open_run
 
@@ -88,8 +88,9 @@ def train(args: VQVAETraining) -> ReconstructionMetrics | None:
         model = VQVAE(with_settings(mage_preset(args.preset), args.set).vqvae).to(accelerator.device)
     uses = CodeUses(model.config.codebook_size)
     accelerator.register_for_checkpointing(uses)
-    run = Run(args, accelerator, model)
     with open_data(args, model.config.image_size, "vqvae.image_size") as (episodes, held_out):
+        check_clips(args, episodes, model.dino)
+        run = Run(args, accelerator, model)
 
         def measured(count: int | None) -> ReconstructionMetrics:
             return measure(model, held_out, range(len(held_out))[:count])
