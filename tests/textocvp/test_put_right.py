@@ -108,6 +108,9 @@ def test_a_dark_picture_is_imagined_from_as_a_bright_one_and_said(shipped: World
     assert float((dark.frames[0, 0] - bright.frames[0, 0]).abs().mean()) < 0.01
     with pytest.warns(ForeignPictureWarning, match="in about 0.7 times the light"):
         shipped.parse(np.stack([lit(picture, 0.7)] * 2))
+    with pytest.warns(ForeignPictureWarning, match="in about 0.7 times the light"):  # of twice the size, too
+        large = shipped.parse(lit(picture, 0.7).repeat(2, 0).repeat(2, 1)[None])
+    np.testing.assert_allclose(large.positions[0, 0], dark.positions[0, 0], atol=0.05)
 
 
 def test_models_that_do_not_know_their_canvas_change_nothing(shipped: WorldModel, picture: np.ndarray) -> None:

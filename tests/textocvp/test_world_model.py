@@ -187,6 +187,9 @@ def test_a_word_it_has_never_met_is_a_warning_that_names_it(placed_world_model, 
     with pytest.warns(UserWarning, match="'flurb'") as caught:
         placed_world_model.rollout(scene, "put the flurb block in the blue bowl", horizon=1)
     assert Path(caught[0].filename).name == "test_world_model.py"  # points at the caller
+    with pytest.warns(UserWarning, match="'flurb'") as caught:
+        placed_world_model.reads("put the flurb block in the blue bowl")
+    assert Path(caught[0].filename).name == "test_world_model.py"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         placed_world_model.rollout(scene, TEXT, horizon=1)

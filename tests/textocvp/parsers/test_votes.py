@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -124,6 +126,13 @@ def test_a_hidden_object_keeps_its_slot_and_what_appears_takes_a_free_one() -> N
     slot = int(winners[0, 5, 5])
     assert torch.equal(state.position[0, 1, slot], state.position[0, 0, slot])
     assert state.presence[0, :, :, 0].sum(1).tolist() == [4, 5, 6]  # the robot comes, then the fourth thing
+
+
+def test_sizes_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_slots is 1: background and robot take 2"):
+        build(VOTES).parser(torch.zeros(1, 1, 3, 32, 32), num_slots=1)
+    with pytest.raises(ValueError, match=r"parser\.image_size is 33: .* squares of 2x2 pixels"):
+        replace(VOTES.parser, image_size=33)
 
 
 def test_clips_parsed_together_are_parsed_as_alone() -> None:
