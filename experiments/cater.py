@@ -69,7 +69,7 @@ LINES["SEER"] = Line(key="SEER", kind="baseline", note="not run", paper=PAPERS["
 CONTROL = {
     "object": "right thing moves",
     "action": "right action",
-    "place": "named cell or next to it",
+    "place": "named cell ± 1",
     "rests": "what turns stays",
 }
 
@@ -291,8 +291,8 @@ CONTROLS = TableSpec(
     [
         Column("mask IoU 9", SPLIT, "9 frames", "iou", 3),
         *(Column(title, SPLIT, "control", metric) for metric, title in CONTROL.items()),
-        Column("contained vanishes", SPLIT, "control", "vanishes"),
-        Column("and then follows", SPLIT, "control", "hidden_follows"),
+        Column("inside vanishes", SPLIT, "control", "vanishes"),
+        Column("it follows", SPLIT, "control", "hidden_follows"),
     ],
     list(MEASURED),
     "Each scene under its own caption and others, judged from masks, wherever the simulator's own masks show it.",
@@ -315,9 +315,9 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         Section(
             "Other captions",
             "A thing moves when the middle of its mask gets further than 3 pixels; two things of one name are alike, "
-            "and either may act. What it does is read off its way in the picture; where it ends, through the camera. "
-            "Masks do not show a turn: of what is told to turn they show only that it stays. What is inside a cone can "
-            "be asked of models whose slots have places.",
+            "and either may act. What it does is read off its way in the picture; where it ends, through the camera: in "
+            "the named cell or in one that touches it. Masks do not show a turn: of what is told to turn they show only "
+            "that it stays. What is inside a cone can be asked of models whose slots have places.",
             [control],
         ),
         Section("Films", ranked, [Clips(found["films"])]),
