@@ -316,8 +316,8 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
             "Other captions",
             "A thing moves when the middle of its mask gets further than 3 pixels; two things of one name are alike, "
             "and either may act. What it does is read off its way in the picture; where it ends, through the camera: "
-            "in the named cell or in one that touches it. Masks show of what is told to turn only that it stays. What is "
-            "inside a cone can be asked of models whose slots have places.",
+            "in the named cell or in one that touches it. Masks show of what is told to turn only that it stays. What "
+            "is inside a cone can be asked of models whose slots have places.",
             [control],
         ),
         Section("Films", ranked, [Clips(found["films"])]),
