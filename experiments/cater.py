@@ -26,7 +26,7 @@ from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Line, Paper, TableSpec
-from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns
+from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns, reach
 from experiments.study.attention import glow
 from experiments.study.cater import SIDE, CaterScene, Judged, cater_scenes, judge, slide_away, slots_of_things
 from experiments.study.clips import extreme_clips
@@ -41,7 +41,6 @@ from textocvp.slots import SlotState
 
 SPLIT = "test"
 LENGTHS = {"9 frames": 9, "19 frames": 19, "clip": 29}
-LONGEST = LENGTHS["clip"]
 VARIANTS = 3  # other captions of a scene
 FOLLOWED = 5.0  # pixels of 64 between the slots of a cone and of what is in it, at most
 
@@ -175,7 +174,7 @@ def follows(model: Any, clip: Actions, truth: Episode, seed: int) -> float | Non
     acts = slide_away((cone, *rest))
     if acts is None or cone.name in {thing.name for thing in rest}:
         return None
-    frame, horizon = fitted(truth.frames[0], model), min(len(truth.frames) - 1, model.longest_horizon or LONGEST)
+    frame, horizon = fitted(truth.frames[0], model), reach(model, len(truth.frames) - 1)
     first = model.rollout(frame, [clip.instruction], horizon=horizon, seed=seed)
     slots = slots_of_things(first, cast(np.ndarray, truth.segmentation)[0])
     if act.thing not in slots or act.into not in slots:
@@ -201,7 +200,7 @@ class Attention:
         """Imagine it once more; a word that a sentence lacks is a dark panel."""
         text, model = self.scene.clip().instruction, worker.world_model
         first = fitted(self.scene.watch(SIDE)[0][0], model)
-        horizon = min(LONGEST, model.longest_horizon or LONGEST)
+        horizon = reach(model, LENGTHS["clip"])
         rollout = model.rollout(first, [text], horizon=horizon, seed=self.seed, attention=True)
         assert rollout.attention is not None
         frames, masks = to_uint8(rollout.frames[0]), rollout.masks[0].cpu().numpy()
@@ -303,7 +302,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
     frames, control = run.tables(list(results.rows))
     ranked = f"The best and the worst by {METRICS[run.measures.main]}."
-    others = {model.key for model in run.models} - {model.key for model in models(run)}
+    others = [model.key for model in run.models if model not in models(run)]  # in the table's order
     absent = [*run.remarks, *(f"{key} is absent: name one of this world, --model {key}=FOLDER." for key in others)]
     return [
         Section(

@@ -46,6 +46,11 @@ def fitted(frames: np.ndarray, model: Any) -> np.ndarray:
     return np.stack(small).reshape(*frames.shape[:-3], own, own, 3)
 
 
+def reach(model: Any, horizon: int) -> int:
+    """So many frames, or as many as the model can imagine at once."""
+    return min(horizon, model.longest_horizon or horizon)
+
+
 def enlarged(pictures_NCHW: Tensor, side: int) -> Tensor:
     """Pictures at side x side, where they are smaller."""
     if pictures_NCHW.shape[-1] == side:
@@ -66,8 +71,7 @@ def drawn(rollout: Rollout, side: int) -> Seen:
 
 def imagine(worker: Worker, model: Any, first_HW3: np.ndarray, text: str, horizon: int, seed: int) -> Seen:
     """What a model imagines, as far as it can; masks of a model without slots are those of our parser."""
-    side, first, longest = len(first_HW3), fitted(first_HW3, model), model.longest_horizon
-    ahead = horizon if longest is None else min(horizon, longest)
+    side, first, ahead = len(first_HW3), fitted(first_HW3, model), reach(model, horizon)
     if hasattr(model, "rollout"):
         return drawn(model.rollout(first, [text], horizon=ahead, seed=seed), side)
     frames = enlarged(model.imagine(first, [text], horizon=ahead, seed=seed)[0].float().cpu(), side)

@@ -7,7 +7,7 @@ colours are common because light falls unevenly on a gray floor (CATER), the flo
 there is no robot.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -93,9 +93,10 @@ def backdrop(frames_THW3: NDArray[np.uint8]) -> Backdrop:
     # Several tones that follow each other are one surface in uneven light.
     steps = np.diff(np.sort(tones_N3.mean(-1)))
     uneven = len(steps) > 1 and steps.max() <= 4 * TONE_RADIUS
+    found = Backdrop(median_HW3, tones_N3)
     if uneven or near_HW.mean() < FLAT:
-        return Backdrop(median_HW3, tones_N3, floor_HW=_floor(median_HW3))
-    return Backdrop(median_HW3, tones_N3, _frame_masks(median_HW3, Backdrop(median_HW3, tones_N3)) > 1)
+        return replace(found, floor_HW=_floor(median_HW3))
+    return replace(found, standing_HW=_frame_masks(median_HW3, found) > 1)
 
 
 def _floor(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -213,8 +214,12 @@ def _parts_of_one_hue(
     parts_HW = np.zeros(inside_HW.shape, int)
     parts_HW[inside_HW] = parts_N
     # Pixels of mixed colours between things go to the nearest part.
-    nearest = ndimage.distance_transform_edt(parts_HW == 0, return_distances=False, return_indices=True)
-    return np.where(inside_HW, parts_HW[tuple(nearest)], 0) if parts_N.any() else parts_HW
+    return np.where(inside_HW, parts_HW[_nearest(parts_HW > 0)], 0) if parts_N.any() else parts_HW
+
+
+def _nearest(found_HW: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ...]:
+    """Row and column of the nearest such pixel to each, both (H, W)."""
+    return tuple(ndimage.distance_transform_edt(~found_HW, return_distances=False, return_indices=True))
 
 
 def _split_by_hue(frame_HW3: NDArray[np.float32], parts_HW: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -236,6 +241,5 @@ def _split_by_hue(frame_HW3: NDArray[np.float32], parts_HW: NDArray[np.int64]) -
         if np.ptp(means_23, axis=0).max() > TWO_HUES and np.bincount(which_N, minlength=2).min() > few:
             second_HW = inside_HW.copy()
             second_HW[inside_HW] = which_N == 1
-            nearest = ndimage.distance_transform_edt(~inside_HW, return_distances=False, return_indices=True)
-            found_HW[its_HW & second_HW[tuple(nearest)]] = found_HW.max() + 1
+            found_HW[its_HW & second_HW[_nearest(inside_HW)]] = found_HW.max() + 1
     return found_HW
