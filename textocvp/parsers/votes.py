@@ -244,7 +244,9 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     used_K = state.is_thing[:, 0].cpu().numpy()
     used, free = (FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:]))
     cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
-    rows, columns = scipy.optimize.linear_sum_assignment(cost_UP)
+    # What is matched is what explains the most pixels: else a tool's tip could turn a thing away from its own.
+    gain_UP = (MOST_COST - cost_UP) * mass_P1[:, 0].cpu().numpy()
+    rows, columns = scipy.optimize.linear_sum_assignment(gain_UP, maximize=True)
     sure = cost_UP[rows, columns] < MOST_COST
     owner_P = np.zeros(P, int)
     owner_P[columns[sure]] = used[rows[sure]]
