@@ -155,8 +155,14 @@ def parser_fingerprint(model: TextOCVP) -> str:
     return weights_fingerprint(model.parser, json.dumps(settings, sort_keys=True))
 
 
-def cached_slots(model: TextOCVP, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1) -> FrameCache:
+def cached_slots(
+    model: TextOCVP, episodes: Episodes, folder: Path, process: int = 0, processes: int = 1, *, every: int = 1
+) -> FrameCache:
     """The slots (K, D) float16 of every frame; this process's share of those that `folder` lacks is computed.
+
+    Args:
+        every: parse an episode's first and last frame, and between them only every so many-th. The others get the
+            slots of the last one that was parsed before them.
 
     Raises:
         CacheError: if `folder` holds the slots of another parser or of other episodes.
@@ -165,6 +171,9 @@ def cached_slots(model: TextOCVP, episodes: Episodes, folder: Path, process: int
     @torch.no_grad()
     def compute(chosen: range) -> NDArray[np.float16]:
         clips = [episodes.frames(index) for index in chosen]
+        lengths = [len(clip) for clip in clips]
+        times = [np.union1d(0, np.arange(length - 1, 0, -every)) for length in lengths]
+        clips = [clip[parsed] for clip, parsed in zip(clips, times, strict=True)]
         longest = max(map(len, clips))
         # Parsing is causal: repeating the last frame of the shorter episodes changes nothing before it.
         padded = np.stack([clip[np.minimum(np.arange(longest), len(clip) - 1)] for clip in clips])
@@ -172,9 +181,14 @@ def cached_slots(model: TextOCVP, episodes: Episodes, folder: Path, process: int
         generator = torch.Generator(model.device).manual_seed(chosen.start)
         slots_BTKD = model.parser(to_frames(padded, model.device), generator=generator).slots_BTKD
         found = slots_BTKD.half().cpu().numpy()
-        return np.concatenate([slots_TKD[: len(clip)] for slots_TKD, clip in zip(found, clips, strict=True)])
+        # From each frame on that was parsed its slots hold, until the next one was.
+        held = [np.diff(parsed, append=length) for parsed, length in zip(times, lengths, strict=True)]
+        return np.concatenate(
+            [slots_TKD[: len(count)].repeat(count, 0) for slots_TKD, count in zip(found, held, strict=True)]
+        )
 
-    return FrameCache(folder, episodes, parser_fingerprint(model)).fill(compute, process, processes)
+    made_by = parser_fingerprint(model) + (f", every {every} frames" if every > 1 else "")
+    return FrameCache(folder, episodes, made_by).fill(compute, process, processes)
 
 
 def cached_features(

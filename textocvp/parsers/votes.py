@@ -197,7 +197,10 @@ def count_votes(
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
     some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
     near_SS = _apart(some_S3, some_S3)
-    density_S = torch.exp(-near_SS.square() / (2 * VOTE_SPREAD**2)).sum(1) * len(votes_L3) / max(1, len(some_S3))
+    exponent_SS = (-near_SS.square() / (2 * VOTE_SPREAD**2)).clamp_min(
+        -40.0
+    )  # beyond, CPUs are slow and nothing is added
+    density_S = exponent_SS.exp().sum(1) * len(votes_L3) / max(1, len(some_S3))
     # Large objects need more votes: else the stray ones of their borders would be objects of their own.
     enough_S = (MIN_SHARE * _pixels_of(some_S3)).clamp_min(min_votes)
     density_S = density_S.masked_fill(density_S < enough_S, 0.0)

@@ -57,6 +57,9 @@ class PredictorTraining(TrainingSettings):
     `--set predictor.window=40` they learn longer rollouts."""
     outcome: bool = False
     """Train the predictor of whole sentences, beside the one that the checkpoint `parser` has."""
+    parse_every: int = 1
+    """With `--outcome`, which learns from first and last frames: parse only every so many-th frame between them. With 3
+    parsing takes a third of the time, and slots keep their objects as well."""
     preset: str | None = None
     """Take text encoder and predictor from this preset instead of from the parser's checkpoint."""
     steps: int = 1100
@@ -163,8 +166,8 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
         assert predictor is not None
         layout, causal = model.config.parser.layout, predictor.config.causal
         share = (accelerator.process_index, accelerator.num_processes)
-        slots = cached_slots(model, episodes, args.out / "slots-train", *share)
-        val_slots = cached_slots(model, held_out, args.out / "slots-val", *share)
+        slots = cached_slots(model, episodes, args.out / "slots-train", *share, every=args.parse_every)
+        val_slots = cached_slots(model, held_out, args.out / "slots-val", *share, every=args.parse_every)
         accelerator.wait_for_everyone()
         # One frame more than the past, so that every time code gets trained.
         longest = int(slots.lengths.max())
@@ -246,6 +249,8 @@ def assemble(
             longer window).
     """
     config = trained.config
+    if args.parse_every > 1 and not args.outcome:
+        raise SettingsError("--parse-every goes with --outcome: all else learns from every frame")
     if args.outcome:
         model = with_outcome(args, trained)
     elif args.finetune:

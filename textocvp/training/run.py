@@ -56,6 +56,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "evaluate_episodes": (1, math.inf),
     "save_minutes": (0.0, math.inf),
     "stride": (1, math.inf),
+    "parse_every": (1, math.inf),
     "clip": (1, math.inf),
     "workers": (0, math.inf),
     "thing_weight": (0.0, 1e6),

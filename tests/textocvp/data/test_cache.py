@@ -124,6 +124,21 @@ def test_slots_are_those_of_the_parser(episodes, tmp_path) -> None:
     assert torch.equal(short[0], padded(cache, 6)[0, :5])  # a long one is cut
 
 
+def test_slots_of_some_frames_stay_until_the_next(episodes, tmp_path) -> None:
+    model = build(PLACED)
+    cache = cached_slots(model, episodes, tmp_path / "slots", every=3)
+    assert cache.lengths.tolist() == LENGTHS
+    for index, length in enumerate(LENGTHS):
+        times = sorted({0, *range(length - 1, 0, -3)})
+        with torch.no_grad():
+            slots_SKD = model.parser(to_frames(episodes.frames(index)[times][None])).slots_BTKD[0]
+        latest = [max(i for i, time in enumerate(times) if time <= t) for t in range(length)]
+        found = torch.from_numpy(cache.episode(index)).float()
+        torch.testing.assert_close(found, slots_SKD[latest], atol=2e-3, rtol=2e-3)
+    with pytest.raises(CacheError, match="made by another network"):
+        cached_slots(model, episodes, tmp_path / "slots")
+
+
 def test_slots_of_another_parser_are_refused(episodes, tmp_path) -> None:
     model = build(PLACED)
     cached_slots(model, episodes, tmp_path / "slots")
