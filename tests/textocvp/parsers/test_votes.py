@@ -112,6 +112,13 @@ def test_a_carried_object_keeps_its_slot_past_another_of_its_colour() -> None:
     assert state.presence[0, :, :, 0].tolist() == [[2, 1, 1, 1, 0, 0]] * 9
 
 
+def test_a_scrap_does_not_turn_a_thing_away_from_its_slot() -> None:
+    """Else the scrap would be the one thing, and this one its hidden neighbour: one thing more would be explained."""
+    thing, hidden, scrap = (2, 12, 12, 7, 7), (1, 0, 19, 32, 9), (4, 14, 9, 2, 2)
+    winners, _ = parse([scene(thing, (3, 12, 20, 7, 7)), scene(thing, hidden, scrap)], {2: RED, 3: RED, 4: RED})
+    assert (winners[:, 12:19, 12:19] == winners[0, 15, 15]).all()
+
+
 def test_a_hidden_object_keeps_its_slot_and_what_appears_takes_a_free_one() -> None:
     hidden = (1, 0, 0, 32, 16)
     labels = [
