@@ -54,7 +54,8 @@ class PredictorTraining(TrainingSettings):
     """Checkpoint with the trained parser and renderer: a bundled name, a folder, or a hub id owner/name."""
     finetune: bool = False
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
-    `--set predictor.window=40` they learn longer rollouts."""
+    `--set predictor.window=40` they learn longer rollouts. If the checkpoint foresees outcomes, its text encoder stays
+    as it is, for these need it."""
     outcome: bool = False
     """Train the predictor of whole sentences, beside the one that the checkpoint `parser` has."""
     parse_every: int = 1
@@ -253,6 +254,7 @@ def assemble(
         raise SettingsError("--parse-every goes with --outcome: all else learns from every frame")
     if args.outcome:
         model = with_outcome(args, trained)
+        meet(model, captions)
     elif args.finetune:
         if args.preset is not None:
             raise SettingsError("finetune keeps the checkpoint's architecture: leave out preset")
@@ -261,10 +263,11 @@ def assemble(
         model = trained
         with allowed_settings():
             extend_window(model, args.set)
-        if isinstance(config.text, WordsConfig):
-            model.text.config = config.text.met(captions)
-            model.config = replace(model.config, text=model.text.config)
-        model.text.train()
+        meet(model, captions)
+        if model.outcome is None:
+            model.text.train()
+        else:  # it was trained with this encoder, and would not understand another
+            model.text.requires_grad_(False).eval()
         model.predictor.train()
     else:
         if args.preset is not None:
@@ -284,6 +287,13 @@ def assemble(
         if part is not None:
             part.requires_grad_(False).eval()
     return model
+
+
+def meet(model: TextOCVP, captions: Iterable[str]) -> None:
+    """Note which forms of sentences the model has been trained on, these captions' too."""
+    if isinstance(model.text.config, WordsConfig):
+        model.text.config = model.text.config.met(captions)
+        model.config = replace(model.config, text=model.text.config)
 
 
 def with_outcome(args: PredictorTraining, trained: TextOCVP) -> TextOCVP:
