@@ -32,7 +32,8 @@ VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
-LATE_AREA = 20  # and of one that comes into sight later: what is smaller is part of something else
+LATE_AREA = 20  # and of one that comes into sight later, or beside the robot: what is smaller is part of something else
+TOUCHES = 2  # pixels between two things that touch, at most
 FIRST_THING = ROBOT_SLOT + 1  # the slots of objects are from here on
 UNSEEN = 0.0  # colour of a slot that holds nothing yet
 
@@ -222,10 +223,13 @@ def _pixels_of(votes_N3: Tensor) -> Tensor:
     return 6 * (2 / SIZE_UNIT * votes_N3[:, 2]).exp()
 
 
-def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor, peak_radius: float = 5.0) -> Tensor:
+def follow(
+    ballot: Ballot, frame_3HW: Tensor, robot_HW: Tensor, state: SlotState, speed_K2: Tensor, peak_radius: float = 5.0
+) -> Tensor:
     """The slot (L,) of each of one frame's object pixels, by place, colour and size.
 
     Args:
+        robot_HW: which pixels show the robot.
         state: slots (K,) of the frame before.
         speed_K2: how far they moved in it.
         peak_radius: as in `VotesConfig`.
@@ -259,9 +263,11 @@ def follow(ballot: Ballot, frame_3HW: Tensor, state: SlotState, speed_K2: Tensor
     if pieces.any():
         owner_P[rest[pieces]] = used[cost_UP[:, rest[pieces]].argmin(0)]
     new = rest[~pieces]  # all in the first frame, when no slot is used
-    if len(used):
-        new = new[mass_P1[new, 0].cpu().numpy() >= LATE_AREA]
-    new = new[: len(free)]
+    around_HW = F.max_pool2d(robot_HW[None].float(), 2 * TOUCHES + 1, 1, TOUCHES)[0]
+    scrap_P = (mass_P1[:, 0] < LATE_AREA).cpu().numpy()
+    touches_P = (masks_PHW * around_HW).amax((1, 2)).bool().cpu().numpy()
+    owner_P[new[(scrap_P & touches_P)[new]]] = ROBOT_SLOT  # its tool has other colours
+    new = new[~(scrap_P & (touches_P | bool(len(used))))[new]][: len(free)]
     owner_P[new] = free[: len(new)]
 
     # A thing that has no peak may stand where it stood, beside a larger one: it keeps the votes nearest to it.
@@ -336,7 +342,8 @@ class VotesParser(SceneParser):
             radius = self.config.peak_radius
             ballot = count_votes(logits_B3HW[b], votes_B3HW[b], K - FIRST_THING, self.config.min_votes, radius)
             one = SlotState(*(part[b] for part in vars(slots).values()))
-            slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], one, speeds_BK2[b], radius)
+            robot_HW = slot_BHW[b] == ROBOT_SLOT
+            slot_BHW[b, ballot.y_L, ballot.x_L] = follow(ballot, seen_B3HW[b], robot_HW, one, speeds_BK2[b], radius)
         return F.one_hot(slot_BHW.to(frames_B3HW.device), K).permute(0, 3, 1, 2).to(frames_B3HW.dtype)
 
     def _nothing(self, frames_B3HW: Tensor, K: int) -> SlotState:

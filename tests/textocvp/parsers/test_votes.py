@@ -119,6 +119,14 @@ def test_a_scrap_does_not_turn_a_thing_away_from_its_slot() -> None:
     assert (winners[:, 12:19, 12:19] == winners[0, 15, 15]).all()
 
 
+def test_a_scrap_at_the_robot_is_its_tool_and_elsewhere_a_thing() -> None:
+    arm, tool, small, later = (1, 0, 10, 14, 4), (2, 15, 11, 3, 2), (3, 26, 26, 3, 3), (4, 4, 15, 2, 3)
+    winners, state = parse([scene(arm, tool, small), scene(arm, tool, small, later)], {2: BLUE, 3: RED, 4: RED})
+    assert (winners[:, 15:18, 11:13] == 1).all() and (winners[1, 4:6, 15:18] == 1).all()
+    assert (winners[:, 26:29, 26:29] == 2).all()
+    assert state.presence[0, :, :, 0].tolist() == [[2, 1, 1, 0, 0, 0]] * 2
+
+
 def test_a_hidden_object_keeps_its_slot_and_what_appears_takes_a_free_one() -> None:
     hidden = (1, 0, 0, 32, 16)
     labels = [
