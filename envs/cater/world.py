@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFilter
 from ..physics.camera import Camera, CameraPreset
 from ..physics.shapes import Mesh, lathed
 from ..physics.simulation import Bullet
+from ..scenes import Light
 from .scenes import EYE, FRAMES, Clip, Thing
 
 CAMERA = CameraPreset(eye=EYE, target=(0.0, 0.0, 0.2), fov=42.0, near=5.0, far=40.0)
@@ -73,23 +74,11 @@ class Table:
         seen = labels[bodies[(many - 1) // 2 :: many, many // 2 :: many] + 1]
         return (image + 0.5).astype(np.uint8), seen
 
-    def _draw(self, material: str) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    def _draw(self, material: str) -> tuple[NDArray[np.uint8], NDArray[np.integer]]:
         """All things as if they were of this material (S, S, 3), and the bodies (S, S) that the pixels show, or -1."""
-        size = self.camera.size * OVERSAMPLING
-        _, _, rgba, _, bodies = self.bullet.getCameraImage(
-            size,
-            size,
-            self.camera.view_matrix,
-            self.camera.projection_matrix,
-            lightDirection=self.light.tolist(),
-            lightAmbientCoeff=AMBIENT,
-            lightDiffuseCoeff=DIFFUSE,
-            lightSpecularCoeff=SHINE[material],
-            shadow=0,
-            renderer=p.ER_TINY_RENDERER,
-        )
-        drawn = np.asarray(rgba, np.uint8).reshape(size, size, 4)[..., :3]
-        return drawn, np.asarray(bodies, np.int64).reshape(size, size)
+        light = Light(self.light.tolist(), AMBIENT, DIFFUSE, SHINE[material])
+        rgba, _, bodies = self.bullet.draw(self.camera.size * OVERSAMPLING, self.camera, light)
+        return rgba[..., :3], bodies
 
     def _floor(self, centers: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
         """The floor (S, S) with the things' shadows, each the outline of what it hides from the light."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..colors import RGB
 from ..geometry import BLOCK_MASS, BOWL_MASS, TABLE, Box2, Sizes
 from ..scene import ObjectSpec, Scene
-from ..scenes import Setup
+from ..scenes import Light, Setup
 from .arm import Joints, arm_urdf
 from .camera import Camera
 from .shapes import bowl_contact_file, bowl_mesh
@@ -53,6 +53,25 @@ class Bullet:
         if self.client < 0:
             raise ClosedEnvironmentError("the environment was closed; make a new one")
         return partial(getattr(p, name), physicsClientId=self.client)
+
+    def draw(
+        self, size: int, camera: Camera, light: Light
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.integer]]:
+        """What a camera sees: colours (S, S, 4), OpenGL's depth buffer (S, S), and bodies (S, S), -1 where none is."""
+        _, _, rgba, depth, bodies = self.getCameraImage(
+            size,
+            size,
+            camera.view_matrix,
+            camera.projection_matrix,
+            lightDirection=light.direction,
+            lightAmbientCoeff=light.ambient,
+            lightDiffuseCoeff=light.diffuse,
+            lightSpecularCoeff=light.specular,
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+        )
+        colors = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)
+        return colors, np.asarray(depth, np.float32).reshape(size, size), np.asarray(bodies).reshape(size, size)
 
 
 class Tabletop:
@@ -91,7 +110,6 @@ class Tabletop:
     def _use(self, setup: Setup) -> None:
         self.setup = setup
         self.camera = Camera(setup.camera, self.image_size, setup.oversampling)
-        self._view, self._projection = self.camera.view_matrix, self.camera.projection_matrix
         self._background = self._empty(self.image_size)
 
     def _empty(self, image_size: int) -> Image:
@@ -150,26 +168,12 @@ class Tabletop:
 
     def render(self, image_size: int | None = None) -> Image:
         """What the camera sees now, in pictures of ``image_size`` pixels or the usual ones."""
-        light, many = self.setup.light, self.setup.oversampling
+        many = self.setup.oversampling
         size = (image_size or self.image_size) * many
         background = self._background if image_size is None else self._empty(image_size)
-        _, _, rgba, depth, bodies = self.bullet.getCameraImage(
-            size,
-            size,
-            self._view,
-            self._projection,
-            lightDirection=light.direction,
-            lightAmbientCoeff=light.ambient,
-            lightDiffuseCoeff=light.diffuse,
-            lightSpecularCoeff=light.specular,
-            shadow=0,
-            renderer=p.ER_TINY_RENDERER,
-        )
-        bodies = np.asarray(bodies).reshape(size, size)
-        depth = np.asarray(depth, dtype=np.float32).reshape(size, size)
+        rgba, depth, bodies = self.bullet.draw(size, self.camera, self.setup.light)
         # Four channels as one number: ten times as fast as a choice by channels.
-        drawn = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4).view(np.uint32)[..., 0]
-        drawn = np.where(bodies == -1, background.rgb.view(np.uint32)[..., 0], drawn)
+        drawn = np.where(bodies == -1, background.rgb.view(np.uint32)[..., 0], rgba.view(np.uint32)[..., 0])
         colors = drawn.view(np.uint8).reshape(size, size, 4)
         rows = np.array([colors[i::many] for i in range(many)]).sum(axis=0, dtype=np.uint16)
         total = np.array([rows[:, i::many, :3] for i in range(many)]).sum(axis=0, dtype=np.uint16)
