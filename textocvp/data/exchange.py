@@ -26,15 +26,8 @@ from PIL import Image
 from textocvp.data.cater import CaterEpisodes
 from textocvp.data.cliport import CliportEpisodes
 from textocvp.data.episodes import Episode, EpisodeFile, Episodes
-from textocvp.data.own_videos import (
-    Imported,
-    OwnVideosError,
-    import_videos,
-    to_square,
-    too_long,
-    video_frames,
-    write_episodes,
-)
+from textocvp.data.own_videos import Imported, OwnVideosError, import_videos, too_long, video_frames, write_episodes
+from textocvp.pictures import bring_to_size
 
 Target = Literal["lerobot", "minari"]
 CAMERA = "observation.images.rgb"
@@ -137,7 +130,7 @@ def _changed(episode: Episode, number: int, size: int | None, crop: bool, every:
     if size is None and H != W:
         raise OwnVideosError(f"its frames are {W}x{H} pixels, and must be square: say --size (and perhaps --crop)")
     if size not in (None, H) or H != W:
-        frames, said = to_square(episode.frames, size or H, crop)
+        frames, said = bring_to_size(episode.frames, (size or H, size or H), crop)
         if episode.segmentation is not None or episode.objects:
             said.append("left out its masks, objects, positions and questions, which are of the frames as they were")
         episode = replace(episode, frames=frames, segmentation=None, position=None, objects=(), questions=())

@@ -308,16 +308,8 @@ def read_video(
             said.append(f"damaged or cut short: {count} frames can be read, and the decoder says: {complaint}")
     if not frames:
         return np.zeros((0, size, size, 3), np.uint8), said, rate
-    whole, how = to_square(np.stack(frames), size, crop)
+    whole, how = bring_to_size(np.stack(frames), (size, size), crop)
     return whole, said + how, rate
-
-
-def to_square(frames_T: NDArray[np.uint8], size: int, crop: bool = False) -> tuple[NDArray[np.uint8], list[str]]:
-    """Frames (T, size, size, 3), with a border or cut off, and what was done, in words."""
-    if frames_T.shape[1:3] == (size, size):
-        return frames_T, []
-    whole, how = bring_to_size(frames_T, (size, size), crop)
-    return whole, [how]
 
 
 def _header(path: Path) -> tuple[float, float]:

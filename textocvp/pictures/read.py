@@ -36,27 +36,27 @@ def read_picture(
     if image_size is None:
         return np.asarray(picture), said
     H, W = image_size
-    before = f"{picture.width}x{picture.height}"
-    if not (resize or crop):
-        if times_larger((picture.height, picture.width), image_size) == 0:
-            raise ValueError(
-                f"it is {before} pixels and the model was trained on {W}x{H}: take the picture at that size or a "
-                "whole multiple of it, or add --resize (with a border) or --crop (without its edges)"
-            )
-    elif picture.size != (W, H):
+    if resize or crop:
         whole, how = bring_to_size(np.asarray(picture)[None], image_size, crop)
-        return whole[0], [*said, how]
+        return whole[0], said + how
+    if times_larger((picture.height, picture.width), image_size) == 0:
+        raise ValueError(
+            f"it is {picture.width}x{picture.height} pixels and the model was trained on {W}x{H}: take the picture at "
+            "that size or a whole multiple of it, or add --resize (with a border) or --crop (without its edges)"
+        )
     return np.asarray(picture), said
 
 
 def bring_to_size(
     frames_T: NDArray[np.uint8], image_size: tuple[int, int], crop: bool = False
-) -> tuple[NDArray[np.uint8], str]:
-    """Frames (T, h, w, 3) at another size (T, H, W, 3), and what was done, in words.
+) -> tuple[NDArray[np.uint8], list[str]]:
+    """Frames (T, h, w, 3) at another size (T, H, W, 3), and what was done, in words; nothing if they have that size.
 
     The border, where the shape is another and nothing is cut off, has the colour of the first frame's edge.
     """
     (H, W), (h, w) = image_size, frames_T.shape[1:3]
+    if (h, w) == (H, W):
+        return frames_T, []
     how = ("cut off its edges and " if crop else "added a border and ") if w * H != W * h else ""
     color = tuple(int(value) for value in np.median(_edge(frames_T[0]), axis=0))
     taken = []
@@ -65,7 +65,7 @@ def bring_to_size(
             taken.append(ImageOps.fit(frame, (W, H), Image.Resampling.BOX))
         else:
             taken.append(ImageOps.pad(frame, (W, H), Image.Resampling.BOX, color=color))
-    return np.stack([np.asarray(frame) for frame in taken]), f"{how}brought it from {w}x{h} to {W}x{H} pixels"
+    return np.stack([np.asarray(frame) for frame in taken]), [f"{how}brought it from {w}x{h} to {W}x{H} pixels"]
 
 
 def _eight_bits(picture: Image.Image, said: list[str]) -> Image.Image:
