@@ -29,7 +29,7 @@ from textocvp.checkpoint import (
     resolve_checkpoint,
     write_config,
 )
-from textocvp.config import ModelConfig, with_settings
+from textocvp.config import ModelConfig, build, with_settings
 from textocvp.files import replacing
 from textocvp.film_page import film_data, save_page
 from textocvp.metrics.lpips_weights import LpipsWeightsError, fetch_lpips
@@ -460,7 +460,7 @@ def _info(command: InfoCommand) -> None:
         table.add_row(name, type(part).__name__, f"{sum(p.numel() for p in part.parameters()):,}")
     table.add_row("whole", type(model).__name__, f"{sum(p.numel() for p in model.parameters()):,}")
     console.print(table)
-    console.print(_tree(CONFIG_FILE, model.config.to_dict()))
+    console.print(_tree(CONFIG_FILE, asdict(model.config)))
 
 
 def _tree(name: str, settings: dict[str, Any]) -> Tree:
@@ -502,7 +502,7 @@ def list_models() -> list[ListedModel]:
             with resolve_checkpoint(name) as folder:
                 data = read_json(folder)
                 is_mage = data.get("architecture") == MAGE
-                configs[name] = MageConfig.from_dict(data) if is_mage else read_config(folder)
+                configs[name] = build(MageConfig, data) if is_mage else read_config(folder)
     return [*(_listed(name, config, name in bundled) for name, config in configs.items()), SEER]
 
 

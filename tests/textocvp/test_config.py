@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
 from textocvp.baselines.mage import MAGE_PRESETS
-from textocvp.config import ModelConfig, with_settings
+from textocvp.config import ModelConfig, build, with_settings
 from textocvp.parsers.savi import SaviConfig
 from textocvp.presets import PRESETS, preset
 from textocvp.renderers.patches import PatchConfig
@@ -17,7 +18,7 @@ from textocvp.slots import SlotLayout
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), *MAGE_PRESETS.values()], ids=lambda config: config.name)
 def test_json_gives_the_configuration_back(config: Any) -> None:
-    assert type(config).from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert build(type(config), json.loads(json.dumps(asdict(config)))) == config
 
 
 def test_settings_reach_the_field_they_name_and_no_other() -> None:

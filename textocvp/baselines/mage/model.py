@@ -35,15 +35,6 @@ class MageConfig:
     axial: AxialConfig = field(default_factory=AxialConfig)
     architecture: Literal["mage"] = ARCHITECTURE  # tells its checkpoints from others
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain nested dictionaries, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> MageConfig:
-        """The inverse of `to_dict`. Raises as `textocvp.config.build`."""
-        return build(cls, data)
-
 
 class Mage(nn.Module):
     """Frames to codes, codes and text to the next codes, codes to frames ("Make It Move", CVPR 2022, figure 2).
@@ -89,14 +80,14 @@ class Mage(nn.Module):
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint."""
-        write_checkpoint(folder, self, self.config.to_dict())
+        write_checkpoint(folder, self, asdict(self.config))
         self.text.save_files(folder / TEXT_FOLDER)
 
     @classmethod
     def load(cls, folder: Path, device: str | torch.device = "cpu") -> Mage:
         """The model of a checkpoint, in evaluation mode. Raises as `read_checkpoint`."""
         files = folder / TEXT_FOLDER
-        model = read_checkpoint(folder, ARCHITECTURE, lambda data: cls(MageConfig.from_dict(data), files))
+        model = read_checkpoint(folder, ARCHITECTURE, lambda data: cls(build(MageConfig, data), files))
         return model.to(device)
 
 
