@@ -76,12 +76,7 @@ class Rollout:
                 return (self.renderer.masks(slots_NKD).float(),)
             return (self._rendered(slots_NKD, seen).masks_BKHW.float(),)
 
-        times, decoded = self._times(frames), self._decoded.masks
-        new = [t for t in dict.fromkeys(times) if t not in decoded]
-        if new:
-            (masks_BtKHW,) = self._draw(new, draw)
-            decoded.update(zip(new, masks_BtKHW.unbind(1), strict=True))
-        return torch.stack([decoded[t] for t in times], dim=1)
+        return self._kept(frames, draw, self._decoded.masks)
 
     def decode_frames(self, frames: slice | Sequence[int]) -> Tensor:
         """Pictures (B, t, 3, H, W), RGB 0..1, of only these frames; an IndexError if there is no such frame."""
@@ -90,14 +85,7 @@ class Rollout:
             rendered = self._rendered(slots_NKD, seen)
             return _to_rgb(rendered.frames_B3HW), rendered.masks_BKHW.float()
 
-        times, decoded = self._times(frames), self._decoded.frames
-        new = [t for t in dict.fromkeys(times) if t not in decoded]
-        if new:
-            frames_Bt3HW, masks_BtKHW = self._draw(new, draw)
-            decoded.update(zip(new, frames_Bt3HW.unbind(1), strict=True))
-            for t, masks_BKHW in zip(new, masks_BtKHW.unbind(1), strict=True):
-                self._decoded.masks.setdefault(t, masks_BKHW)
-        return torch.stack([decoded[t] for t in times], dim=1)
+        return self._kept(frames, draw, self._decoded.frames, self._decoded.masks)
 
     def decode_objects(self, frames: slice | Sequence[int]) -> Tensor:
         """Every slot drawn alone (B, t, K, 3, H, W), RGB 0..1, at only these frames. These pictures are not kept.
@@ -130,6 +118,16 @@ class Rollout:
         if not times:
             raise IndexError(f"no frame asked for; this rollout has frames 0..{T - 1}")
         return times
+
+    def _kept(self, frames: slice | Sequence[int], draw: Draw, *kept: dict[int, Tensor]) -> Tensor:
+        """What `kept[0]` has of these frames; what it lacks is drawn first, and all that `draw` gives is kept."""
+        times = self._times(frames)
+        new = [t for t in dict.fromkeys(times) if t not in kept[0]]
+        if new:
+            for kind, drawn in zip(kept, self._draw(new, draw), strict=True):
+                for t, one in zip(new, drawn.unbind(1), strict=True):
+                    kind.setdefault(t, one)
+        return torch.stack([kept[0][t] for t in times], dim=1)
 
     def _rendered(self, slots_NKD: Tensor, seen: Seen | None) -> Rendered:
         return self.renderer(slots_NKD) if seen is None else self.renderer(slots_NKD, seen)
