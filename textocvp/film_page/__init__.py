@@ -124,14 +124,9 @@ def with_films(page: str) -> str:
     return page
 
 
-def what_if_page(title: str, films: Sequence[Mapping[str, Any]]) -> str:
-    """One HTML page that shows films beside each other and needs nothing else."""
-    data = json.dumps({"title": title, "films": list(films)}).replace("<", "\\u003c")
-    return with_films(asset("what_if.html")).replace("/*data*/", data)
-
-
 def save_page(path: Path, title: str, films: Sequence[Mapping[str, Any]]) -> Path:
-    """Write `what_if_page`; missing folders are made."""
+    """Write one HTML page that shows films beside each other and needs nothing else; missing folders are made."""
+    data = json.dumps({"title": title, "films": list(films)}).replace("<", "\\u003c")
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, what_if_page(title, films))
+    replace_text(path, with_films(asset("what_if.html")).replace("/*data*/", data))
     return path
