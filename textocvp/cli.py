@@ -226,24 +226,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            if arguments[:1] == ["play"]:
-                return _play(arguments[1:])
-            if arguments[:1] == ["data"]:
-                return _data(arguments[1:])
-            _run(arguments)
+            return _run(arguments)
     except (Mistake, CheckpointError) as error:
         print(f"textocvp: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("textocvp: stopped", file=sys.stderr)
         return 130
-    return 0
 
 
-def _run(arguments: list[str]) -> None:
-    if arguments[:1] == ["train"]:
-        _train(arguments[1:])
-        return
+def _run(arguments: list[str]) -> int:
+    further = {"train": _train, "data": _data, "play": _play}  # have commands or options of their own
+    if arguments and arguments[0] in further:
+        return further[arguments[0]](arguments[1:])
     command: Any = tyro.cli(
         Command,
         prog="textocvp",
@@ -260,13 +255,14 @@ def _run(arguments: list[str]) -> None:
         _weights()
     else:
         _info(command)
+    return 0
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"textocvp: warning: {message}", file=sys.stderr)
 
 
-def _train(arguments: list[str]) -> None:
+def _train(arguments: list[str]) -> int:
     # Imported here because training brings libraries that take seconds to load.
     from textocvp.baselines.mage import train_mage, train_vqvae
     from textocvp.data import open_episodes
@@ -317,6 +313,7 @@ def _train(arguments: list[str]) -> None:
         if error.errno and error.filename is None:  # those of a full disk have none
             error.filename = str(chosen.out)
         raise Mistake(str(error)) from error
+    return 0
 
 
 def _data(arguments: list[str]) -> int:
