@@ -98,7 +98,7 @@ class Rollout:
         """
 
         def draw(slots_NKD: Tensor, seen: Seen | None) -> tuple[Tensor, ...]:
-            return (_to_rgb(self._rendered(slots_NKD, seen).object_frames_BK3HW),)
+            return (_to_rgb(self._rendered(slots_NKD, seen).draw_objects()),)
 
         return self._draw(self._times(frames), draw, at_once=max(1, CHUNK // self.slots.shape[2]))[0]
 

@@ -21,14 +21,10 @@ class Rendered:
 
     frames_B3HW: Tensor  # the composed frame, -1..1; a renderer may overshoot slightly, `Rollout` clamps
     masks_BKHW: Tensor  # each slot's share of each pixel; sums to 1 over the slots
-    draw_objects: Callable[[], Tensor]  # makes `object_frames_BK3HW`
+    # Draws each slot alone (B, K, 3, H, W); the frame is their mask-weighted sum, or drawn from that of their features.
+    draw_objects: Callable[[], Tensor]
     # What the frame was drawn from, of L patches row by row; None for renderers that draw pixels from slots.
     features_BLF: Tensor | None = None
-
-    @property
-    def object_frames_BK3HW(self) -> Tensor:
-        """Each slot drawn alone. The frame is their mask-weighted sum, or drawn from that of their features."""
-        return self.draw_objects()
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ def test_slots_are_exchangeable(weights: Path) -> None:
     torch.testing.assert_close(drawn_2.frames_B3HW, drawn.frames_B3HW, **close)
     torch.testing.assert_close(drawn_2.features_BLF, drawn.features_BLF, **close)
     torch.testing.assert_close(drawn_2.masks_BKHW, drawn.masks_BKHW[:, ORDER], **close)
-    torch.testing.assert_close(drawn_2.object_frames_BK3HW, drawn.object_frames_BK3HW[:, ORDER], **close)
+    torch.testing.assert_close(drawn_2.draw_objects(), drawn.draw_objects()[:, ORDER], **close)
     torch.testing.assert_close(drawn.masks_BKHW.sum(1), torch.ones(2, 32, 32))
     torch.testing.assert_close(masks, drawn.masks_BKHW)
 

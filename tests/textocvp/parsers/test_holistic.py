@@ -54,7 +54,7 @@ def test_the_one_mask_is_the_whole_frame(size: int):
     rendered = build(config).renderer(torch.randn(3, 1, 24))
     assert rendered.frames_B3HW.shape == (3, 3, size, size)
     assert torch.equal(rendered.masks_BKHW, torch.ones(3, 1, size, size))
-    assert torch.equal(rendered.object_frames_BK3HW[:, 0], rendered.frames_B3HW)
+    assert torch.equal(rendered.draw_objects()[:, 0], rendered.frames_B3HW)
 
 
 def test_it_is_used_like_every_model(model: TextOCVP, scene: np.ndarray, tmp_path: Path):

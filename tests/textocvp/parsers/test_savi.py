@@ -127,9 +127,9 @@ def test_the_renderer_draws_a_set_of_slots() -> None:
     with torch.no_grad():
         drawn, reordered = renderer(slots), renderer(slots[:, ORDER])
         masks = renderer.masks(slots)
-    assert drawn.frames_B3HW.shape == (2, 3, 32, 32) and drawn.object_frames_BK3HW.shape == (2, 4, 3, 32, 32)
+    assert drawn.frames_B3HW.shape == (2, 3, 32, 32) and drawn.draw_objects().shape == (2, 4, 3, 32, 32)
     torch.testing.assert_close(drawn.masks_BKHW.sum(1), torch.ones(2, 32, 32))
-    composed = (drawn.masks_BKHW[:, :, None] * drawn.object_frames_BK3HW).sum(1)
+    composed = (drawn.masks_BKHW[:, :, None] * drawn.draw_objects()).sum(1)
     torch.testing.assert_close(drawn.frames_B3HW, composed)
     torch.testing.assert_close(reordered.frames_B3HW, drawn.frames_B3HW, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(reordered.masks_BKHW, drawn.masks_BKHW[:, ORDER], atol=1e-5, rtol=1e-4)

@@ -169,7 +169,7 @@ def test_masks_share_out_every_pixel_and_make_up_the_frame() -> None:
     _, _, seen, state = look(model)
     slots = torch.cat([state.join(), moved(state, BLOCK, 20, 3), moved(state, ROBOT_SLOT, 9, 12)])
     for drawn, size in ((model(slots), SMALL), (model(slots, seen), LARGE)):
-        masks, objects = drawn.masks_BKHW, drawn.object_frames_BK3HW
+        masks, objects = drawn.masks_BKHW, drawn.draw_objects()
         assert masks.shape == (3, 5, size, size) and objects.shape == (3, 5, 3, size, size)
         torch.testing.assert_close(masks.sum(1), torch.ones(3, size, size))
         assert masks[:, UNUSED].max() < 1e-4

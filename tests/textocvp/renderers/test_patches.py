@@ -41,13 +41,13 @@ def test_it_draws_a_set_of_slots(mask_prior: bool) -> None:
     with torch.no_grad():
         drawn, reordered = patches(slots), patches(slots[:, order])
         masks = patches.masks(slots)
-    assert drawn.frames_B3HW.shape == (2, 3, 16, 16) and drawn.object_frames_BK3HW.shape == (2, 3, 3, 16, 16)
+    assert drawn.frames_B3HW.shape == (2, 3, 16, 16) and drawn.draw_objects().shape == (2, 3, 3, 16, 16)
     torch.testing.assert_close(drawn.masks_BKHW.sum(1), torch.ones(2, 16, 16))
-    composed = (drawn.masks_BKHW[:, :, None] * drawn.object_frames_BK3HW).sum(1)
+    composed = (drawn.masks_BKHW[:, :, None] * drawn.draw_objects()).sum(1)
     torch.testing.assert_close(drawn.frames_B3HW, composed)
     torch.testing.assert_close(reordered.frames_B3HW, drawn.frames_B3HW)
     torch.testing.assert_close(reordered.masks_BKHW, drawn.masks_BKHW[:, order])
-    torch.testing.assert_close(reordered.object_frames_BK3HW, drawn.object_frames_BK3HW[:, order])
+    torch.testing.assert_close(reordered.draw_objects(), drawn.draw_objects()[:, order])
     torch.testing.assert_close(masks, drawn.masks_BKHW)
 
 
