@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import h5py
 import numpy as np
@@ -23,6 +23,8 @@ FORMAT_VERSIONS = (1, 2)
 FRAME_ARRAYS = ("arm", "gripper", "action", "reward", "state", "object_position")  # a row for each frame
 
 ROBOT, FIRST_OBJECT = 1, 2  # labels in segmentations of version 1
+
+E = TypeVar("E", bound="Episodes")
 
 
 class EpisodeObject(NamedTuple):
@@ -174,7 +176,7 @@ class Episodes(ABC):
         """Number of episodes."""
         return len(self.lengths)
 
-    def __enter__(self) -> Episodes:
+    def __enter__(self: E) -> E:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -326,9 +328,6 @@ class EpisodeFile(Episodes):
         if self._file is not None and self._process == os.getpid():
             self._file.close()
         self._file = None
-
-    def __enter__(self) -> EpisodeFile:
-        return self
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_file": None, "_process": -1}

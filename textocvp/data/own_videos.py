@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 from tqdm import tqdm
 
-from textocvp.data.episodes import FORMAT, FORMAT_VERSIONS, Episode, Episodes, words_of
+from textocvp.data.episodes import FORMAT, FORMAT_VERSIONS, Episode, Episodes, Truth, words_of
 from textocvp.files import hdf5_to_write, replacing
 from textocvp.pictures import bring_to_size, read_picture
 
@@ -350,19 +350,14 @@ def describe(episodes: Episodes) -> list[str]:
     """What a file holds, a line each."""
     lengths, size = episodes.lengths, episodes.image_size
     words = sorted(words_of(episodes.instructions))
-    known = episodes.truth(0)
-    lacking = [name for name in ("segmentation", "objects", "questions") if not _has(known, name)]
+    known = vars(episodes.truth(0) or Truth())
+    lacking = [name for name in ("segmentation", "objects", "questions") if known[name] is None or not len(known[name])]
     return [
         f"{len(episodes)} episodes of {lengths.min()} to {lengths.max()} frames (median {np.median(lengths):g}), "
         f"{int(lengths.sum())} in all, {size}x{size}",
         f"{len(set(episodes.instructions))} different sentences of {len(words)} words: {', '.join(words)}",
         f"not in the file, and so not measured in training: {', '.join(lacking) or 'nothing'}",
     ]
-
-
-def _has(known: object, name: str) -> bool:
-    value = getattr(known, name, None)
-    return value is not None and len(value) > 0
 
 
 def problems(episodes: Episodes, window: int | None = None) -> list[str]:
