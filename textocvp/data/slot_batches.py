@@ -58,7 +58,7 @@ class SlotBatches:
         place_jitter: float = 0.01,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.layout, self.recolor = layout, recolor and layout.explicit and text.words_have_rgb
+        self.layout, self.recolor = layout, recolor and layout.explicit and text.config.words_have_rgb
         self.color_jitter, self.place_jitter, self.device = color_jitter, place_jitter, device
         self._slots_ETKD = padded(cache, frames, every)
         self._words = text.lookup(cache.instructions).to("cpu")

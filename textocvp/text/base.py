@@ -84,10 +84,6 @@ class TextEncoder(nn.Module):
         self.config = config
 
     @property
-    def words_have_rgb(self) -> bool:
-        return self.config.words_have_rgb
-
-    @property
     @abstractmethod
     def device(self) -> torch.device:
         """Where its learned parameters are."""

@@ -220,7 +220,7 @@ class WordEncoder(TextEncoder):
 
     def nothing_said(self, text: str) -> str:
         known = [word for word in self.config.vocabulary if self.config.knows(word)]
-        known += ["names of colours"] if self.words_have_rgb else []
+        known += ["names of colours"] if self.config.words_have_rgb else []
         return f"a text needs at least one word that the model knows, got {text!r}; it knows {', '.join(known)}"
 
     def _row_and_color(self, word: str) -> tuple[int, RGB | None]:

@@ -99,7 +99,7 @@ def test_states_computed_under_autocast_or_without_gradients_serve_training(enco
 
 def test_words_name_no_colors_and_none_is_unknown(encoder):
     words = encoder.lookup([SHORT])
-    assert not words.names_color_BL.any() and not encoder.words_have_rgb
+    assert not words.names_color_BL.any() and not encoder.config.words_have_rgb
     assert encoder.unknown_words("put the zorble block") == []
     with pytest.raises(ValueError, match=r"color_bias.*text.kind=lexicon, not 'minilm'"):
         TextOCVP(replace(TINY, predictor=PLACED.predictor))
