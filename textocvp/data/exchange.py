@@ -428,7 +428,7 @@ def _to_minari(episodes: EpisodeFile, out: Path, name: str) -> list[str]:
             if episode.action[-1].any() or (episode.reward is not None and episode.reward[-1]):
                 said.append(f"episode {index}: the last action and its reward, which lead to no frame")
             ends = np.arange(1, T) == T - 1
-            known = {name: v for name in ("success",) if (v := getattr(episode, name)) is not None}
+            known = {} if episode.success is None else {"success": episode.success}
             observations: dict[str, Any] = {"rgb": episode.frames, "instruction": [episode.instruction] * T}
             if episode.state is not None:
                 observations["proprio"] = episode.state
