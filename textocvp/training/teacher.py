@@ -123,9 +123,9 @@ def background_tones(median_HW3: NDArray[np.float32]) -> NDArray[np.float32]:
     total = len(left)
     tones: list[NDArray[np.float32]] = []
     while len(left):
-        values, counts = np.unique((left // 4).astype(int) @ [1, 64, 4096], return_counts=True)
-        near = (left // 4).astype(int) @ [1, 64, 4096] == values[counts.argmax()]
-        tone = np.median(left[near], axis=0)
+        cells = (left // 4).astype(int) @ [1, 64, 4096]
+        values, counts = np.unique(cells, return_counts=True)
+        tone = np.median(left[cells == values[counts.argmax()]], axis=0)
         inside = np.abs(left - tone).max(-1) <= TONE_RADIUS
         if tones and inside.sum() < TONE_SHARE * total:
             break
