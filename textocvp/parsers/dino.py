@@ -1,8 +1,5 @@
 """The frozen image encoder of the published CLIPort models: DINOv2 (Oquab et al. 2023), through transformers."""
 
-from pathlib import Path
-from typing import Any
-
 from torch import Tensor, nn
 
 from textocvp.parsers.frozen import FrozenEncoder
@@ -30,9 +27,6 @@ class DinoEncoder(FrozenEncoder):
         weights: a folder with `config.json` and `model.safetensors`, or a hub id; empty for facebook/dinov2-base.
         others: as `FrozenEncoder`.
     """
-
-    def __init__(self, weights: str | Path = "", *, dim: int = 768, patch: int = 14, **others: Any) -> None:
-        super().__init__(weights, dim=dim, patch=patch, **others)
 
     def _read(self) -> tuple[nn.Module, str]:
         from transformers import Dinov2Config, Dinov2Model  # takes seconds, and only this needs them

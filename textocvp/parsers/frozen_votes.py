@@ -7,7 +7,6 @@ import json
 import math
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -40,9 +39,6 @@ class VotesEncoder(FrozenEncoder):
         weights: a checkpoint's folder, or the name of a bundled one; empty for `cater`.
         others: as `FrozenEncoder`.
     """
-
-    def __init__(self, weights: str | Path = "", *, dim: int = WIDTH, patch: int = STRIDE, **others: Any) -> None:
-        super().__init__(weights, dim=dim, patch=patch, **others)
 
     def _read(self) -> tuple[nn.Module, str]:
         name = self.weights or DEFAULT

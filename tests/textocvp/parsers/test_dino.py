@@ -94,7 +94,7 @@ def test_a_checkpoint_of_a_whole_classifier_in_half_precision_is_read(folder: Pa
 
 def test_nothing_is_made_up_where_weights_are_missing_or_wrong(folder: Path, tmp_path: Path) -> None:
     frames = torch.zeros(1, 3, 24, 24)
-    nowhere = DinoEncoder(tmp_path / "nowhere")  # building it is no error, looking through it is
+    nowhere = DinoEncoder(tmp_path / "nowhere", dim=768, patch=14)  # building it is no error, looking through it is
     with pytest.raises(WeightsError, match=r"hf download facebook/dinov2-base.*parser\.encoder_weights"):
         nowhere(torch.zeros(1, 3, 28, 28))
     with pytest.raises(WeightsError, match=r"parser\.encoder_dim is 8, that of the weights .* is 16"):

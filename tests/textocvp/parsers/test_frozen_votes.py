@@ -57,7 +57,7 @@ def student(voter: Path | str, **changes: object) -> ModelConfig:
 
 def test_features_are_what_the_network_says(voter: Path) -> None:
     network = TextOCVP.from_pretrained(voter).parser.network
-    found = VotesEncoder(voter)(frames())
+    found = VotesEncoder(voter, dim=9, patch=2)(frames())
     assert found.shape == (3, 16 * 16, 9)
     assert torch.equal(found, found.half().float())  # a cache loses nothing
     with torch.no_grad():
@@ -113,7 +113,7 @@ def test_the_bundled_network_tells_twins_apart() -> None:
     picture = torch.full((1, 3, 64, 64), 0.3)
     for left in (16, 40):
         picture[:, :, 30:38, left : left + 8] = torch.tensor([0.6, -0.8, -0.8])[:, None, None]
-    grid = VotesEncoder()(picture)[0].unflatten(0, (32, 32))
+    grid = VotesEncoder(dim=9, patch=2)(picture)[0].unflatten(0, (32, 32))
     for left in (16, 40):
         inside = grid[16:18, left // 2 + 1 : left // 2 + 3]
         assert inside[..., OBJECT].min() > 0.6
@@ -127,7 +127,7 @@ def test_slots_may_begin_with_what_is_elected() -> None:
     picture = torch.full((2, 3, 64, 64), 0.3)
     for left in (16, 40):
         picture[0, :, 30:38, left : left + 8] = torch.tensor([0.6, -0.8, -0.8])[:, None, None]
-    found = VotedClusters()(VotesEncoder()(picture).transpose(1, 2).unflatten(2, (32, 32)), 5)
+    found = VotedClusters()(VotesEncoder(dim=9, patch=2)(picture).transpose(1, 2).unflatten(2, (32, 32)), 5)
     assert torch.equal(found.masks.sum(1), torch.ones(2, 32, 32))
     assert found.presence.tolist() == [[1, 1, 1, 0, 0], [1, 0, 0, 0, 0]]
     owner = found.masks[0].argmax(0)
@@ -148,14 +148,14 @@ def test_slots_may_begin_with_what_is_elected() -> None:
 def test_what_is_no_voting_network_is_refused(voter: Path, change: object, message: str) -> None:
     change(voter)  # type: ignore[operator]
     with pytest.raises(WeightsError, match=message):
-        VotesEncoder(voter).load()
+        VotesEncoder(voter, dim=9, patch=2).load()
 
 
 def test_sizes_must_be_those_of_the_network(voter: Path) -> None:
     with pytest.raises(WeightsError, match=r"parser\.encoder_dim is 30, that of the weights in .* is 9"):
-        VotesEncoder(voter, dim=30).load()
+        VotesEncoder(voter, dim=30, patch=2).load()
     with pytest.raises(WeightsError, match=r"parser\.encoder_patch is 4, .* is 2"):
-        VotesEncoder(voter, patch=4).load()
+        VotesEncoder(voter, dim=9, patch=4).load()
 
 
 def set_kind(folder: Path, kind: str) -> None:
