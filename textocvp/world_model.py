@@ -246,8 +246,7 @@ class WorldModel:
         # One for each scene: where it stands in a batch must not matter.
         seed = checked_seed(seed)
         generators = [torch.Generator(device=model.device).manual_seed(seed) for _ in frames_BT3HW]
-        own_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
-        parsed = model.parser(own_BT3HW, num_slots=num_slots, generator=generators)
+        parsed = model.parser(self._at_own_size(frames_BT3HW), num_slots=num_slots, generator=generators)
         slots_BTKD = parsed.slots_BTKD.float()
         seen = model.renderer.remember(frames_BT3HW[:, 0], parsed.attention_BTKHW[:, 0], slots_BTKD[:, 0])
         size = self.image_size
@@ -281,7 +280,7 @@ class WorldModel:
         if frames_BT3HW.shape[-2:] != self.image_size:
             if self.model.renderer.keeps_size:
                 return frames_BT3HW
-            frames_BT3HW = self._at_own_size(frames_BT3HW.flatten(0, 1)).unflatten(0, frames_BT3HW.shape[:2])
+            frames_BT3HW = self._at_own_size(frames_BT3HW)
         frames_BT3HW, done = put_right(frames_BT3HW, own, self.model.restorer)
         if done:
             said = f"the picture does not look like those that this model was trained on: it is {', and '.join(done)}"
@@ -306,5 +305,6 @@ class WorldModel:
         own_B3HW = self._at_own_size(frames_B3HW)
         warn_of_foreign(own_B3HW, psnr_of(own_B3HW, parsed.slots[:, 0]), own, psnr_of, depth=depth + 1)
 
-    def _at_own_size(self, frames_N3HW: Tensor) -> Tensor:
-        return F.adaptive_avg_pool2d(frames_N3HW, self.image_size)
+    def _at_own_size(self, frames: Tensor) -> Tensor:
+        """Frames (..., 3, H, W) at the size of those that the model was trained on."""
+        return F.adaptive_avg_pool2d(frames.flatten(0, -4), self.image_size).unflatten(0, frames.shape[:-3])
