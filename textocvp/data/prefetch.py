@@ -2,17 +2,31 @@
 
 import signal
 from collections.abc import Callable, Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 Batch = TypeVar("Batch")
+
+
+class _Steps(Dataset):
+    """The batch of any step, for a DataLoader."""
+
+    def __init__(self, read: Callable[[int], Any]) -> None:
+        self.read = read
+
+    def __getitem__(self, step: int) -> Any:
+        return self.read(step)
 
 
 def _outlive_the_signal(worker: int) -> None:
     # Clusters send SIGTERM to whole groups of processes, and the training process still finishes its update.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+def _as_read(batch: Batch) -> Batch:
+    return batch
 
 
 def prefetch(read: Callable[[int], Batch], steps: range, workers: int) -> Iterable[Batch]:
@@ -23,11 +37,11 @@ def prefetch(read: Callable[[int], Batch], steps: range, workers: int) -> Iterab
     """
     if workers == 0:
         return map(read, steps)
-    # The data set are the numbers of the steps, and each becomes its batch where others collate samples.
     return DataLoader(
-        steps,  # type: ignore[arg-type]
+        _Steps(read),
+        sampler=steps,
         batch_size=None,
-        collate_fn=read,
+        collate_fn=_as_read,
         num_workers=workers,
         worker_init_fn=_outlive_the_signal,
         generator=torch.Generator(),  # else it would draw from PyTorch's own, and so change what follows
