@@ -25,13 +25,13 @@ from experiments.report.gif import gif
 from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
-from experiments.report.tables import Column, Line, Paper, TableSpec
+from experiments.report.tables import Column, Paper, TableSpec, quoted
 from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns, reach
 from experiments.study.attention import glow
 from experiments.study.cater import SIDE, CaterScene, Judged, cater_scenes, judge, slide_away, slots_of_things
 from experiments.study.clips import extreme_clips
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.methods import Model, lines
+from experiments.study.methods import Model, lines, with_paper
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import hold_last, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
@@ -46,12 +46,7 @@ FOLLOWED = 5.0  # pixels of 64 between the slots of a cone and of what is in it,
 
 
 def _paper(label: str, **figures: tuple[float, float]) -> Paper:
-    found = {
-        (SPLIT, length, metric): value
-        for metric, values in figures.items()
-        for length, value in zip(LENGTHS, values, strict=False)
-    }
-    return Paper(f"paper, {label}", found, "CATER-hard at 64x64, its own renders")
+    return Paper(f"paper, {label}", quoted(SPLIT, LENGTHS, **figures), "CATER-hard at 64x64, its own renders")
 
 
 PAPERS = {
@@ -63,8 +58,7 @@ PAPERS = {
 }
 WORDS = ("ours, few updates", "plain attention", "colour lexicon")  # the ablation of how words find their slots
 MEASURED = lines(("ours", *WORDS, "savi", "OCVP-Seq", "Non-OC", "MAGE", "true frames", "wrong text", "copy frame"))
-LINES: dict[str, Line] = {line.key: replace(line, paper=PAPERS.get(line.key)) for line in MEASURED}
-LINES["SEER"] = Line(key="SEER", kind="baseline", note="not run", paper=PAPERS["SEER"])
+LINES = with_paper(MEASURED, PAPERS)
 CONTROL = {
     "object": "right thing moves",
     "action": "right action",

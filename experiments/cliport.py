@@ -26,14 +26,14 @@ import torch
 from envs.tasks.base import CLIPORT_RADIUS
 from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
-from experiments.report.rows import Key, Row, figure_rows, mean_row, rate_row
-from experiments.report.tables import Column, Line, Paper, TableSpec
+from experiments.report.rows import Key, Row, figure_rows
+from experiments.report.tables import Column, Paper, TableSpec, quoted
 from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns
 from experiments.study.cliport import Recorded, Source, misses, other_sentences, read
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.methods import HORIZON, METHODS, Method, Model, lines
+from experiments.study.methods import HORIZON, METHODS, Method, Model, lines, with_paper
 from experiments.study.pool import Unit, Worker
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
@@ -83,13 +83,9 @@ PLAYERS: dict[str, Method] = {
 """Who acts in the closed loop."""
 
 
-def _paper(label: str, **figures: tuple[float, float]) -> Paper:
-    """The paper's figures: metric -> at 9 and 19 frames; of success, of the original sentence and of other bowls."""
-    found = {
-        (ALL, variant, metric): value
-        for metric, values in figures.items()
-        for variant, value in zip(SENTENCES if metric == "success" else LENGTHS, values, strict=True)
-    }
+def _paper(label: str, success: Sequence[float] = (), **figures: tuple[float, float]) -> Paper:
+    """The paper's figures at 9 and 19 frames; of success, of the original sentence and of other bowls."""
+    found = quoted(ALL, LENGTHS, **figures) | quoted(ALL, SENTENCES, success=success)
     return Paper(f"paper, {label}", found, "CLIPort at 336x336, other episodes")
 
 
@@ -105,8 +101,7 @@ PAPERS = {
     "copy frame": _paper("Copy-Seed", iou=(0.540, 0.525)),
 }  # fmt: skip
 MEASURED = lines(("ours", TAUGHT, LITE0, "Non-OC", "MAGE", "true frames", LITE0_PARSER, "wrong text", "copy frame"))
-LINES: dict[str, Line] = {line.key: replace(line, paper=PAPERS.get(line.key)) for line in MEASURED}
-LINES["SEER"] = Line(key="SEER", kind="baseline", note="not run", paper=PAPERS["SEER"])
+LINES = with_paper(MEASURED, PAPERS)
 
 
 @dataclass
@@ -293,12 +288,12 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 
 def rows(run: Run, found: Found) -> list[Row]:
     """Every figure over all episodes and over each split; how many there are; the closed loop."""
-    values: dict[Key, list[float]] = {}
-    for split, figures in found["episodes"]:
-        for (method, variant, metric), value in figures.items():
-            for place in dict.fromkeys((ALL, split)):
-                values.setdefault((method, place, variant, metric), []).append(value)
-    made = [(rate_row if key[3] == "success" else mean_row)(*key, its) for key, its in values.items()]
+    made = figure_rows(
+        (place, {key: value})
+        for split, figures in found["episodes"]
+        for key, value in figures.items()
+        for place in dict.fromkeys((ALL, split))
+    )
     if n := len(found["episodes"]):
         made.append(Row("episodes", ALL, ALL, "n", n, n, n, n))
     return made + figure_rows(

@@ -90,7 +90,7 @@ def pick_figures(rows: Iterable[Row], wanted: Mapping[str, Key]) -> dict[str, fl
 
 
 def figure_rows(scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]]) -> list[Row]:
-    """A row for each figure of each split: of truth values a rate, of numbers a mean.
+    """A row for each figure of each split: of truth values and of success a rate, of other numbers a mean.
 
     Args:
         scenes: the split of each and its figures: (method, variant, metric) -> a number, or one or more truth values.
@@ -99,4 +99,5 @@ def figure_rows(scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]]
     for split, figures in scenes:
         for (method, variant, metric), value in figures.items():
             values.setdefault((method, split, variant, metric), []).append(value)
-    return [(rate_row if np.asarray(its).dtype == bool else mean_row)(*key, its) for key, its in values.items()]
+    rates = {key: key[3].endswith("success") or np.asarray(its).dtype == bool for key, its in values.items()}
+    return [(rate_row if rates[key] else mean_row)(*key, its) for key, its in values.items()]

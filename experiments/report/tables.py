@@ -183,6 +183,12 @@ class Paper:
     note: str = "CLIPort at 336x336, another camera"  # where it was measured
 
 
+def quoted(split: str, variants: Iterable[str], **figures: Sequence[float]) -> dict[tuple[str, str, str], float]:
+    """Figures of a split as `Paper` takes them: metric -> its figures, for the variants or the first of them."""
+    pairs = {metric: zip(variants, values, strict=False) for metric, values in figures.items()}
+    return {(split, variant, metric): value for metric, its in pairs.items() for variant, value in its}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Line:
     """What a line of a table shows."""

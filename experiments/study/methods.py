@@ -4,13 +4,13 @@ To compare another baseline or another planner, add one entry to `METHODS`.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
-from experiments.report.tables import Line, Paper
+from experiments.report.tables import Line, Paper, quoted
 from planning import (
     BeamPlanner,
     Controller,
@@ -26,9 +26,6 @@ from textocvp.checkpoint import CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
 HORIZON = 24  # frames of an episode of the tabletop after the first one
-SPLITS = ("test", "unseen_colors", "more_objects")  # of the paper's figures
-Figures = Mapping[tuple[str, str, str], float]  # (split, variant, metric) -> figure
-Pairs = Sequence[tuple[float | None, float | None]]
 MakePlanner = Callable[[Imagines, Goal, np.random.Generator, int], Planner]
 """Makes a planner of a world model, the goal of the episode, a source of chance, and the seed of the slots."""
 
@@ -74,49 +71,36 @@ def _literal(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -
     return LiteralPlanner(cast(Foresees, model), seed=seed)  # which it never asks
 
 
-def _paper(label: str, jedi: tuple[float, float], more: Figures | None = None, **columns: Pairs) -> Paper:
-    """The paper's figures of predicted frames: metric -> at 9 and at 19 frames, of each split that it has."""
-    figures = dict(more or {})
-    for metric, values in {**columns, "jedi": [jedi]}.items():
-        splits = SPLITS[1:] if metric.endswith("drop") else SPLITS
-        for split, pair in zip(splits, values, strict=False):
-            for variant, value in zip(("9 frames", "19 frames"), pair, strict=True):
-                if value is not None:
-                    figures[split, variant, metric] = value
-    return Paper(label, figures)
-
-
-_OURS = _paper(
+_FIRST, _MEAN = ("9 frames", "19 frames"), ("frames 1-9", "frames 1-19")
+_OURS = Paper(
     "paper, TextOCVP",
-    ssim=[(0.950, 0.931), (0.946, 0.927), (0.936, 0.921)],
-    lpips=[(0.062, 0.078), (0.066, 0.083), (0.076, 0.090)],
-    ssim_drop=[(0.004, None), (0.015, 0.011)],
-    lpips_drop=[(0.064, 0.064), (0.226, 0.154)],
-    jedi=(1.36, 2.23),
-    more={
-        # Controllability: mean of 5 runs over 100 sequences.
-        ("controllability", "original", "predicted_success"): 0.83,
-        ("controllability", "variant 1", "predicted_success"): 0.86,
-        ("controllability", "variant 2", "predicted_success"): 0.80,
-        ("controllability", "variant 3", "predicted_success"): 0.81,
-        ("controllability", "variants mean", "predicted_success"): 0.82,
-        ("test", "frames 1-9", "iou"): 0.573,
-        ("test", "frames 1-19", "iou"): 0.569,
+    {
+        **quoted("test", _FIRST, ssim=(0.950, 0.931), lpips=(0.062, 0.078), jedi=(1.36, 2.23)),
+        **quoted("unseen_colors", _FIRST, ssim=(0.946, 0.927), lpips=(0.066, 0.083)),
+        **quoted("unseen_colors", _FIRST, ssim_drop=(0.004,), lpips_drop=(0.064, 0.064)),
+        **quoted("more_objects", _FIRST, ssim=(0.936, 0.921), lpips=(0.076, 0.090)),
+        **quoted("more_objects", _FIRST, ssim_drop=(0.015, 0.011), lpips_drop=(0.226, 0.154)),
+        # Mean of 5 runs over 100 sequences.
+        **quoted(
+            "controllability",
+            ("original", "variant 1", "variant 2", "variant 3", "variants mean"),
+            predicted_success=(0.83, 0.86, 0.80, 0.81, 0.82),
+        ),
+        **quoted("test", _MEAN, iou=(0.573, 0.569)),
     },
 )
-_MAGE = _paper(
+_MAGE = Paper(
     "paper, MAGE-DINO",
-    ssim=[(0.940, 0.931), (0.935, 0.924), (0.929, 0.920)],
-    lpips=[(0.064, 0.075), (0.076, 0.087), (0.088, 0.094)],
-    ssim_drop=[(0.005, 0.007), (0.012, 0.012)],
-    lpips_drop=[(0.19, 0.16), (0.375, 0.253)],
-    jedi=(2.11, 2.59),
+    {
+        **quoted("test", _FIRST, ssim=(0.940, 0.931), lpips=(0.064, 0.075), jedi=(2.11, 2.59)),
+        **quoted("unseen_colors", _FIRST, ssim=(0.935, 0.924), lpips=(0.076, 0.087)),
+        **quoted("unseen_colors", _FIRST, ssim_drop=(0.005, 0.007), lpips_drop=(0.19, 0.16)),
+        **quoted("more_objects", _FIRST, ssim=(0.929, 0.920), lpips=(0.088, 0.094)),
+        **quoted("more_objects", _FIRST, ssim_drop=(0.012, 0.012), lpips_drop=(0.375, 0.253)),
+    },
 )
-
-
-def _paper_iou(label: str, at_9: float, at_19: float) -> Paper:
-    return Paper(label, {("test", "frames 1-9", "iou"): at_9, ("test", "frames 1-19", "iou"): at_19})
-
+_TRUE_FRAMES = Paper("paper, parser on true frames", quoted("test", _MEAN, iou=(0.554, 0.553)))
+_COPY_SEED = Paper("paper, Copy-Seed", quoted("test", _MEAN, iou=(0.540, 0.525)))
 
 _DATA = "--data data/tabletop-train.h5 --val data/tabletop-val.h5"
 _TRAIN_PREDICTOR = "textocvp train predictor --parser textocvp/checkpoints/tabletop-small"
@@ -167,12 +151,12 @@ METHODS: dict[str, Method] = {
                note="the published pipeline, with EfficientNet-Lite0 in DINOv2's place"),
         Method(key="slot attention on EfficientNet-Lite0", kind="ceiling", hue=5, model="cliport-lite0",
                train=_TRAIN_LITE0, note="its parser and renderer on the true frames, nothing imagined"),
-        Method(key="true frames", kind="ceiling", hue=1, paper=_paper_iou("paper, parser on true frames", 0.554, 0.553),
+        Method(key="true frames", kind="ceiling", hue=1, paper=_TRUE_FRAMES,
                note="parser and renderer on the true frames, nothing imagined"),
         Method(key="wrong text", kind="control", hue=4, note="imagined with a sentence that names something else"),
         Method(key="copy frame", kind="control", hue=2, note="the first frame repeated"),
         Method(key="copy seed", kind="control", hue=2, note="the first frame's masks held still",
-               paper=_paper_iou("paper, Copy-Seed", 0.540, 0.525)),
+               paper=_COPY_SEED),
         Method(key="no imagination", kind="control", hue=4, plan=_literal, controller=LiteralController,
                note="picks where the named block is seen, places where the named bowl is seen"),
         Method(key="expert", kind="ceiling", hue=1, note="scripted, knows every pose", expert=True),
@@ -199,6 +183,12 @@ def lines(keys: Iterable[str], notes: Mapping[str, str] | None = None) -> tuple[
     """
     notes = notes or {}
     return tuple(replace(METHODS[key], note=notes.get(key, METHODS[key].note)) for key in keys)
+
+
+def with_paper(measured: Iterable[Line], papers: Mapping[str, Paper]) -> dict[str, Line]:
+    """Lines with the paper's figures below them, and SEER, which only the paper has measured."""
+    lines = {line.key: replace(line, paper=papers.get(line.key)) for line in measured}
+    return {**lines, "SEER": Line(key="SEER", kind="baseline", note="not run", paper=papers["SEER"])}
 
 
 @dataclass(frozen=True)
