@@ -343,7 +343,7 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
         replace(
             spec, title=f"{spec.title}: {split}", lines=MEASURED,
             columns=[replace(column, split=split) for column in spec.columns],
-        ).table(figures, run.missing_keys)
+        ).table(figures, run.missing)
         for split, spec in product(dict.fromkeys(one.split for one in episodes), (FRAMES, MASKS))
     ]  # fmt: skip
     longest = {"ours": run.world_model.longest_horizon, **{model.key: model.longest for model in known}}

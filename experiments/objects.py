@@ -202,7 +202,7 @@ ARI = _table("Foreground ARI", "foreground_ari", MEANS)
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    figures, missing = list(results.rows), run.missing_keys
+    figures, missing = list(results.rows), run.missing
     measured = [variant for variant in MEANS if results.find("ours", variant, "iou")]
     titles = {metric: title for metric, (_, title) in METRICS.items()}
     apart = TableSpec(

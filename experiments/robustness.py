@@ -365,7 +365,7 @@ SHORT_TABLES = [
 
 def page(run: Run, results: Results, found: Found) -> list[Section]:
     """The sections of the report."""
-    figures, missing = list(results.rows), run.missing_keys
+    figures, missing = list(results.rows), run.missing
     name, metric = METRICS[run.measures.main], f"{run.measures.main}_drop"
     dropped = [Column(SPLITS[s], s, SHORT, metric, percent=True, paper="lpips_drop") for s in SHIFTED]
     drops = TableSpec("", dropped, FRAME_LINES)

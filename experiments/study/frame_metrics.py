@@ -102,11 +102,6 @@ class FrameScores:
     curves: Mapping[str, np.ndarray]
     features: Mapping[int, np.ndarray]  # length -> (D,) for JEDi
 
-    def mean(self, metric: str, length: int) -> float | None:
-        """Mean over the first `length` frames after the observed one; None for a prediction that is shorter."""
-        curve = self.curves.get(metric)
-        return None if curve is None or len(curve) < length else float(curve[:length].mean())
-
 
 class Scorer:
     """Measures the predictions of one scene; what concerns the real frames is computed once.

@@ -203,21 +203,8 @@ class Model:
     longest: int | None  # how many frames it can imagine at once; None for any number
 
 
-@dataclass(frozen=True)
-class Missing:
-    """A method that cannot be measured here, and why."""
-
-    key: str
-    reason: str
-
-    @property
-    def text(self) -> str:
-        """Both, as a sentence."""
-        return f"{self.key} is absent: {self.reason}."
-
-
-def find_models(loads: Mapping[str, LoadModel]) -> tuple[tuple[Model, ...], tuple[Missing, ...]]:
-    """The models that are there, and those that are not with the reason, in the order of `METHODS`.
+def find_models(loads: Mapping[str, LoadModel]) -> tuple[tuple[Model, ...], dict[str, str]]:
+    """The models that are there, and key -> reason of those that are not, in the order of `METHODS`.
 
     Args:
         loads: key of a method -> makes its model.
@@ -225,7 +212,7 @@ def find_models(loads: Mapping[str, LoadModel]) -> tuple[tuple[Model, ...], tupl
     Raises:
         CheckpointError: if a checkpoint that is not the bundled one cannot be loaded: somebody has asked for it.
     """
-    present, missing = [], []
+    present, missing = [], {}
     for key in sorted(loads, key=list(METHODS).index):
         method, load = METHODS[key], loads[key]
         try:
@@ -233,8 +220,8 @@ def find_models(loads: Mapping[str, LoadModel]) -> tuple[tuple[Model, ...], tupl
         except CheckpointError:
             if load != LoadCheckpoint(method.model):
                 raise
-            missing.append(Missing(key, f"not trained: `{method.train}`"))
+            missing[key] = f"not trained: `{method.train}`"
             continue
         where = model.checkpoint
         present.append(Model(key, load, method.slots, where.name, where.sha256, model.longest_horizon))
-    return tuple(present), tuple(missing)
+    return tuple(present), missing

@@ -19,7 +19,7 @@ from typing import Any, cast
 
 import tyro
 
-from experiments.report.page import AGAIN, Card, CardSpec, Report, Section
+from experiments.report.page import AGAIN, CardSpec, Report, Section
 from experiments.report.progress import StudyProgress
 from experiments.report.results import Checkpoint, Results, package_versions
 from experiments.report.rows import Key, Row, pick_figures
@@ -149,7 +149,7 @@ class Study:
     # more work, that follows from what was found; may name only parts that `units` announced
     cases: Callable[[Run, Found], Mapping[str, Sequence[Unit[Any]]]] = lambda run, found: {}
     # the first figures of the report
-    cards: Sequence[CardSpec] | Callable[[Run, Results], Sequence[CardSpec | Card]] = ()
+    cards: Sequence[CardSpec] | Callable[[Run, Results], Sequence[CardSpec]] = ()
     # name -> key of the row. A mapping is a promise, and what of it was not measured is an error; a function
     # of the run may name more than can be measured.
     headline: Mapping[str, Key] | Callable[[Run], Mapping[str, Key]] = field(default_factory=dict)
@@ -182,7 +182,7 @@ class Run:
         folder: where it writes.
         world_model: a world model to look at; units get their own.
         models: of the methods, as far as they are there.
-        missing, remarks: methods that cannot be measured, and why; sentences that say so.
+        missing, remarks: methods that cannot be measured -> why; sentences that say so.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -218,9 +218,9 @@ class Run:
             bundled = {key: METHODS[key].model for key in study.methods if METHODS[key].model}
             loads = {key: LoadCheckpoint(asked.get(key, name)) for key, name in bundled.items()}
         self.models, self.missing = find_models(loads)
-        self.missing_keys = tuple(one.key for one in self.missing)
         self.measures = measures or study.measures(args)
-        self.remarks = [one.text for one in self.missing] + list(filter(None, [self.measures.absent]))
+        self.remarks = [f"{key} is absent: {reason}." for key, reason in self.missing.items()]
+        self.remarks += filter(None, [self.measures.absent])
 
     @cached_property
     def prepared(self) -> Any:
@@ -243,7 +243,7 @@ class Run:
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """The study's tables."""
-        return [spec.table(rows, self.missing_keys) for spec in self.study.tables]
+        return [spec.table(rows, self.missing) for spec in self.study.tables]
 
     def headline(self, rows: Sequence[Row]) -> dict[str, float]:
         """The figures that are asked for by name.
@@ -345,7 +345,7 @@ def exit_in_a_line(interrupted: str) -> Iterator[None]:
 def _write(this: Run, results: Results, found: Found, manifest: str) -> None:
     study = this.study
     cards = study.cards(this, results) if callable(study.cards) else study.cards
-    filled = [card.fill(results) if isinstance(card, CardSpec) else card for card in cards]
+    filled = [card.fill(results) for card in cards]
     sections, command = study.page(this, results, found), this.args.command(study.name)
     report = Report(study.title, study.question, results, filled, sections, command, study.again)
     with this.folder.fill() as partial:
