@@ -22,10 +22,10 @@ import tyro
 from rich.console import Console
 
 from experiments.report.page import Entry, Tone, environment
-from experiments.report.results import Checkpoint, Results
+from experiments.report.results import Results
 from experiments.report.tables import Cell, Table, TableRow
 from experiments.study.run import OutputFolder, Run, Study, StudyArgs, UsageError, exit_in_a_line
-from textocvp.checkpoint import CheckpointError
+from textocvp.checkpoint import Checkpoint, CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 
 NAMES = (
@@ -78,7 +78,7 @@ def main(
     if wrong := [name for name in args.only if name not in outcomes]:
         raise UsageError(f"unknown study {wrong[0]!r}; known: {', '.join(outcomes)}")
     folder, console = OutputFolder(args.folder("")), Console()
-    where = (load or LoadCheckpoint(args.checkpoint))().checkpoint
+    weights = (load or LoadCheckpoint(args.checkpoint))().checkpoint
     for study in studies:
         wanted = not args.only or study.name in args.only
         if not (wanted and args.fresh) and is_done(study, args.of(study), load):
@@ -93,7 +93,7 @@ def main(
             outcomes[study.name] = ("failed", "bad", problem) if problem else DONE
         console.print(f"{study.name}: {outcomes[study.name][0]}", highlight=False)
         # After every study, so that there is something to look at while the next one runs.
-        write_pages(folder, args, Checkpoint(where.name, where.sha256), studies, outcomes)
+        write_pages(folder, args, weights, studies, outcomes)
     console.print(f"Index: {folder.path / 'index.html'}", highlight=False)
     return int(any(problem for *_, problem in outcomes.values()))
 

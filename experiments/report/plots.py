@@ -62,41 +62,46 @@ DARK = Theme(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Series:
-    """One series of figures with intervals, one entry a group; None where it was not measured."""
-
-    label: str  # its name in the legend
-    # (value, low, high) a group. For a figure without an interval low = value = high.
-    points: Sequence[tuple[float, float, float] | None]
-    hollow: bool = False  # drawn as a ring: figures quoted from elsewhere
-    color: int | None = None  # index into the theme's colours; its place among the series if None
-
-
-def interval_plot(
+def plot_table(
     name: str,
-    groups: Sequence[str],
-    series: Sequence[Series],
+    spec: TableSpec,
+    rows: Iterable[Row],
     *,
     label: str,
-    caption: str = "",
+    caption: str = "Dots with 95 % intervals over scenes.",
     limits: tuple[float, float] | None = (0.0, 1.0),
+    lines: Sequence[Line] = (),
 ) -> Figure:
-    """Dots with 95 % intervals, groups from top to bottom. `label` and `limits` (None for automatic) are the axis'."""
+    """The figures of a table as dots with intervals: a group for each column, from top to bottom, in it every line.
+
+    Lines of which nothing was measured are left out.
+
+    Args:
+        label, limits: of the axis; None for automatic limits.
+        lines: shows only these.
+    """
+    rows, series = list(rows), []
+    for line in lines or spec.lines:
+        series.append((line.name, spec.points(rows, line), line.hue, False))
+        if line.paper:  # as rings; they have no interval
+            series.append((line.paper.label, spec.paper_points(line), line.hue, True))
+    series = [one for one in series if any(one[1])]
+    if any(quoted for *_, quoted in series):
+        caption += " Rings are the paper's figures."
+    groups = [column.title for column in spec.columns]
 
     def draw(canvas: Canvas, theme: Theme) -> None:
         axes = canvas.add_subplot()
-        for i, one in enumerate(series):
+        for i, (title, points, hue, quoted) in enumerate(series):
             offset = 0.0 if len(series) == 1 else (i / (len(series) - 1) - 0.5) * 0.56
-            color = theme.series[(i if one.color is None else one.color) % len(theme.series)]
-            measured = [(g + offset, *point) for g, point in enumerate(one.points) if point is not None]
-            if measured:
-                ys, values, lows, highs = zip(*measured, strict=True)
-                axes.hlines(ys, lows, highs, color=color, linewidth=2, alpha=0.55, capstyle="round")
-                axes.plot(
-                    values, ys, "o", markersize=6, color=color, markeredgewidth=1.6, label=one.label,
-                    markerfacecolor=theme.page if one.hollow else color, clip_on=False, zorder=3,
-                )  # fmt: skip
+            color = theme.series[hue % len(theme.series)]
+            measured = [(g + offset, *point) for g, point in enumerate(points) if point is not None]
+            ys, values, lows, highs = zip(*measured, strict=True)
+            axes.hlines(ys, lows, highs, color=color, linewidth=2, alpha=0.55, capstyle="round")
+            axes.plot(
+                values, ys, "o", markersize=6, color=color, markeredgewidth=1.6, label=title,
+                markerfacecolor=theme.page if quoted else color, clip_on=False, zorder=3,
+            )  # fmt: skip
         for g in range(1, len(groups)):
             axes.axhline(g - 0.5, color=theme.faint, linewidth=0.8)
         axes.set_yticks(range(len(groups)), groups)
@@ -111,37 +116,11 @@ def interval_plot(
         )  # fmt: skip
 
     alt = "; ".join(
-        f"{one.label}: " + ", ".join(f"{g} {p[0]:.2f}" for g, p in zip(groups, one.points, strict=True) if p)
-        for one in series
+        f"{title}: " + ", ".join(f"{g} {point[0]:.2f}" for g, point in zip(groups, points, strict=True) if point)
+        for title, points, *_ in series
     )
     height = 1.2 + len(groups) * max(0.34, 0.115 * len(series))
     return _figure(name, draw, (NARROW, height), f"{label}. {alt}", caption)
-
-
-def plot_table(
-    name: str,
-    spec: TableSpec,
-    rows: Iterable[Row],
-    *,
-    label: str,
-    caption: str = "Dots with 95 % intervals over scenes.",
-    limits: tuple[float, float] | None = (0.0, 1.0),
-    lines: Sequence[Line] = (),
-) -> Figure:
-    """The figures of a table as an `interval_plot`: a group for each column, a series for each line that was measured.
-
-    The other arguments are those of `interval_plot`; `lines` shows only these.
-    """
-    rows, series = list(rows), []
-    for line in lines or spec.lines:
-        series.append(Series(line.name, spec.points(rows, line), color=line.hue))
-        if line.paper:
-            series.append(Series(line.paper.label, spec.paper_points(line), hollow=True, color=line.hue))
-    series = [one for one in series if any(one.points)]
-    if any(one.hollow for one in series):
-        caption += " Rings are the paper's figures."
-    groups = [column.title for column in spec.columns]
-    return interval_plot(name, groups, series, label=label, caption=caption, limits=limits)
 
 
 def curve_plot(

@@ -10,16 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from experiments.report.rows import Row, is_number
+from textocvp.checkpoint import Checkpoint
 
 PACKAGES = ("textocvp", "torch", "numpy", "pybullet", "gymnasium")
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Which weights were measured: the name they were asked for by, and the SHA-256 of the weights file."""
-
-    name: str
-    sha256: str
 
 
 @dataclass(frozen=True)

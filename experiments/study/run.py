@@ -18,18 +18,19 @@ from pathlib import Path
 from typing import Any, cast
 
 import tyro
+from joblib import cpu_count
 
 from experiments.report.page import AGAIN, CardSpec, Report, Section
 from experiments.report.progress import StudyProgress
-from experiments.report.results import Checkpoint, Results, package_versions
+from experiments.report.results import Results, package_versions
 from experiments.report.rows import Key, Row, pick_figures
 from experiments.report.tables import Table, TableSpec
 from experiments.study.frame_metrics import Measures
 from experiments.study.kept import KeptWork, file_digest, identity_of
 from experiments.study.methods import METHODS, find_models
-from experiments.study.pool import Pool, Unit, available_cores
+from experiments.study.pool import Pool, Unit
 from experiments.study.scenes import scene_line
-from textocvp.checkpoint import CheckpointError
+from textocvp.checkpoint import Checkpoint, CheckpointError
 from textocvp.protocols import LoadCheckpoint, LoadModel
 from textocvp.world_model import WorldModel
 
@@ -230,8 +231,7 @@ class Run:
     @property
     def checkpoint(self) -> Checkpoint:
         """The weights of the world model."""
-        where = self.world_model.checkpoint
-        return Checkpoint(where.name, where.sha256)
+        return self.world_model.checkpoint
 
     @cached_property
     def identity(self) -> str:
@@ -267,7 +267,7 @@ def run(study: Study, args: StudyArgs | None = None, **doubles: Any) -> Results:
     """
     this = Run(study, args or study.args(), **doubles)
     _ = this.prepared  # may find that the model does not do
-    pool = Pool(this.load, 1 if study.one_process else this.args.workers or available_cores())
+    pool = Pool(this.load, 1 if study.one_process else this.args.workers or cpu_count())
     planned = study.units(this)
     found: dict[str, list[Any]] = {part: [] for part in planned}
     seeds: dict[str, list[int]] = {"slots": [this.args.seed]}

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from joblib import cpu_count
 from scipy.stats import binom
 
-from experiments.study.pool import available_cores
 from textocvp.metrics.intervals import Interval
 
 Work = Callable[[], object]
-CORES = available_cores()
+CORES = cpu_count()
 FEWEST = 3  # rounds that are always made, however long they take
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from experiments.report.gif import gif, paint, segmentation_colors
 from experiments.report.page import Card, Clip, Clips, Report, Section
-from experiments.report.plots import Series, heat_map, interval_plot
-from experiments.report.results import Checkpoint, EpisodeLine, Results
+from experiments.report.plots import heat_map, plot_table
+from experiments.report.results import EpisodeLine, Results
 from experiments.report.rows import Row
-from experiments.report.tables import Cell, Table, TableRow
+from experiments.report.tables import Cell, Column, Line, Table, TableRow, TableSpec
+from textocvp.checkpoint import Checkpoint
 
 
 def row(value: float = 0.9, low: float = 0.8, high: float = 0.95, method: str = "ours") -> Row:
@@ -45,7 +46,8 @@ def report(quick: bool = False) -> Report:
     clip = Clip(
         "a.gif", gif([[film, film], [film, film]]), ("imagined", "real"), "put <b>it</b> there", badge="worst 1"
     )
-    plot = interval_plot("p.png", ["original", "variants"], [Series("ours", [(0.9, 0.8, 1.0), None])], label="success")
+    places = [Column(title, "controllability", title, "predicted_success") for title in ("original", "variants")]
+    plot = plot_table("p.png", TableSpec("", places, [Line(key="ours")]), [row()], label="success")
     heat = heat_map("h.png", np.eye(3), ["block", "bowl", "arm"], ["put", "the", "block"], label="attention")
     return Report(
         title="Controllability",

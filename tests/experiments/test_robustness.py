@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.report.results import Checkpoint, Results
+from experiments.report.results import Results
 from experiments.report.rows import Row
 from experiments.report.tables import as_percent
 from experiments.robustness import (
@@ -38,6 +38,7 @@ from experiments.study.run import Run, ScenesArgs, run
 from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
 from tests.experiments.still import LoadStill
+from textocvp.checkpoint import Checkpoint
 
 ST_LPIPS = Measures(("st_lpips",), None, (), (("lpips", "no weights here"),))
 BARE = Measures()
