@@ -28,7 +28,7 @@ from experiments.study.ablation_runs import PARSERS, PREDICTORS, PRESETS, RUNS, 
 from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.judge import imagine_and_judge
+from experiments.study.judge import imagine_and_trace, judge
 from experiments.study.mask_metrics import labels_of, score_masks
 from experiments.study.methods import HORIZON, Model, lines
 from experiments.study.pool import Unit, Worker
@@ -126,13 +126,16 @@ class FollowingScene:
                 warnings.filterwarnings("ignore", "the text encoder has never met", UserWarning)
                 model = one.model(worker)
                 parsed = model.parse(seen_1HW3, seed=self.seed, num_slots=one.num_slots)
-                rollout, ours, wrong = imagine_and_judge(model, parsed, ground, sampled.texts, self.seed)
-            for metric, good_V in ((ENDS, ours.miss_SV[0] < NEAR), ("predicted_success", ours.success_SV[0])):
+                rollout, ours, wrong = imagine_and_trace(model, parsed, ground, sampled.texts, self.seed)
+            (success_V, miss_V), (_, wrong_miss_V) = (
+                [its.numpy() for its in judge(traced)] for traced in (ours, wrong)
+            )
+            for metric, good_V in ((ENDS, miss_V < NEAR), ("predicted_success", success_V)):
                 figures[one.name, "original", metric] = good_V[0]
                 if self.variants:
                     figures[one.name, "variants mean", metric] = good_V[1:]
             if self.variants:
-                figures[one.name, "wrong text", ENDS] = wrong.miss_SV[0] < NEAR
+                figures[one.name, "wrong text", ENDS] = wrong_miss_V < NEAR
             if scorer is not None:
                 frames_T3HW = rollout.select(0).decode_frames(range(LENGTH + 1))[0]
                 for metric, curve in scorer.score(Prediction(one.name, frames_T3HW)).curves.items():

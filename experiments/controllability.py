@@ -24,7 +24,7 @@ from experiments.report.rows import Row, figure_rows, mean_row, rate_row
 from experiments.report.tables import Column, Line, TableSpec, columns
 from experiments.study.clips import PredictionClip, episode_clips, extremes_by_scene
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome, planning_seconds, timings
-from experiments.study.judge import Verdicts, find_things, first_frame, judge, stack, trace
+from experiments.study.judge import Verdicts, find_things, first_frame, imagine_and_trace, judge, stack, trace
 from experiments.study.methods import HORIZON, METHODS, PLANNERS, lines
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import hold_last
@@ -118,18 +118,13 @@ class PredictedScene:
         sampled = sample_scene(env, self.scene, self.variants)
         texts, ground = list(sampled.texts), AppearanceGrounder.from_info(sampled.info)
         instructions = [Instruction.parse(text) for text in texts]
-        # Rolling the list by one judges the rollout of each instruction for its neighbour in the list.
-        others = instructions[1:] + instructions[:1]
         judged: dict[str, list] = {"ours": [], "wrong text": [], "copy frame": []}
         imagined = []
         for seed in self.slot_seeds:
-            seen = sampled.observation["rgb"]
-            rollout = worker.world_model.rollout(seen, texts, horizon=HORIZON, seed=seed)
-            grounding = find_things(rollout, ground, instructions)
-            imagined.append(trace(rollout, grounding, instructions))
-            judged["ours"].append(judge(imagined[-1]))
-            judged["wrong text"].append(judge(trace(rollout, grounding, others)))
-            judged["copy frame"].append(judge(first_frame(imagined[-1])))
+            _, ours, wrong = imagine_and_trace(worker.world_model, sampled.observation["rgb"], ground, texts, seed)
+            imagined.append(ours)
+            for method, traced in (("ours", ours), ("wrong text", wrong), ("copy frame", first_frame(ours))):
+                judged[method].append(judge(traced))
         true = []
         for variant, instruction in enumerate(instructions):
             played = play_expert(env, sampled, variant)

@@ -1,7 +1,7 @@
 """Do imagined rollouts show what the sentence says? Judged on their masks (paper, section 4.4)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,13 +13,12 @@ from planning import (
     AppearanceGrounder,
     Grounding,
     GroundingError,
-    Imagines,
     Instruction,
     Trace,
     measure_rollout,
     succeeds,
 )
-from textocvp import Rollout
+from textocvp import Rollout, WorldModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +61,8 @@ def trace(rollout: Rollout, grounding: Grounding | None, instructions: Sequence[
 
 def first_frame(traced: Trace) -> Trace:
     """The trace of the first frame repeated."""
-    contact_Bt, distance_Bt = (
-        along_Bt[:, :1].expand_as(along_Bt) for along_Bt in (traced.contact_Bt, traced.distance_Bt)
-    )
-    return Trace(traced.frames, contact_Bt, distance_Bt, traced.within_B)
+    contact_Bt, distance_Bt = (its_Bt[:, :1].expand_as(its_Bt) for its_Bt in (traced.contact_Bt, traced.distance_Bt))
+    return replace(traced, contact_Bt=contact_Bt, distance_Bt=distance_Bt)
 
 
 def judge(traced: Trace) -> tuple[Tensor, Tensor]:
@@ -86,20 +83,17 @@ def judge_rollout(rollout: Rollout, ground: AppearanceGrounder, text: str) -> bo
     return bool(success_B[0])
 
 
-def imagine_and_judge(
-    world_model: Imagines, parsed: Rollout, ground: AppearanceGrounder, texts: Sequence[str], seed: int
-) -> tuple[Rollout, Verdicts, Verdicts]:
-    """Imagine one parsed scene (B = T = 1) with V instructions and one slot seed.
+def imagine_and_trace(
+    world_model: WorldModel, seen: Rollout | np.ndarray, ground: AppearanceGrounder, texts: Sequence[str], seed: int
+) -> tuple[Rollout, Trace, Trace]:
+    """Imagine one scene, parsed (B = T = 1) or as a picture (H, W, 3), with V instructions and one slot seed.
 
     Returns:
-        the rollouts, one an instruction; the verdicts of each on its own instruction; and those on the next one of the
-        list, for which it was not imagined. Both (1, V).
+        the rollouts, one an instruction; the traces of each for its own instruction; and those for the next one of the
+        list, for which it was not imagined.
     """
     instructions = [Instruction.parse(text) for text in texts]
-    rollout = world_model.rollout(parsed, list(texts), horizon=HORIZON, seed=seed)
+    rollout = world_model.rollout(seen, list(texts), horizon=HORIZON, seed=seed)
     grounding = find_things(rollout, ground, instructions)
-    ours, wrong = (
-        stack([judge(trace(rollout, grounding, asked))])
-        for asked in (instructions, instructions[1:] + instructions[:1])
-    )
+    ours, wrong = (trace(rollout, grounding, asked) for asked in (instructions, instructions[1:] + instructions[:1]))
     return rollout, ours, wrong
