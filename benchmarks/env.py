@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from timeit import timeit
 from typing import Any
 
 import gymnasium as gym
@@ -56,10 +57,7 @@ def measure(scene: str, size: int, stride: int, episodes: int) -> list[float]:
 
 
 def _mean_ms(call: Any, times: int) -> float:
-    begin = time.process_time()
-    for _ in range(times):
-        call()
-    return 1e3 * (time.process_time() - begin) / times
+    return 1e3 * timeit(call, number=times, timer=time.process_time) / times
 
 
 def clip_speed(folder: Path) -> float:

@@ -153,16 +153,6 @@ class _State:
         return (*self.before.rollouts(), self.batch.select(self.row))
 
 
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """What is seen and wanted."""
-
-    parsed: Rollout
-    grounding: Grounding
-    wanted: Wanted
-    things: Sequence[Thing]
-
-
 @dataclass
 class SearchPlanner:
     """A* search over sentences, with a budget, for the fewest after which the goal is foreseen to hold.
@@ -190,13 +180,12 @@ class SearchPlanner:
     def plan(self, rgb: NDArray[np.uint8], goal: AnyGoal, grounder: Grounder) -> Plan:
         """The best sequence; see `Planner.plan`. Its rollouts have two frames each: before a sentence, and after."""
         began = perf_counter()
-        parsed, grounding, wanted = self.look(rgb, goal, grounder)
+        parsed, grounding, wanted = look = self.look(rgb, goal, grounder)
         things, sentences = sorted(grounding.things), grounding.instructions(*self.relations)
         if isinstance(goal, Goal):  # its own sentences first: of equally good plans the obvious one
             sentences = tuple(sorted(sentences, key=lambda one: one not in goal.instructions))
         if not sentences:
             raise GroundingError(f"nothing can be said of {', '.join(map(str, things)) or 'an empty scene'}")
-        look = _Look(parsed, grounding, wanted, things)
         start = _State(parsed, 0)
         found: list[_State] = []  # all that was imagined
         goals: list[_State] = []  # those of one length in which the goal holds
@@ -238,18 +227,20 @@ class SearchPlanner:
         ranking = tuple(Candidate(one.instructions, -one.away, one.unmet == 0) for one in ranked)
         return Plan(ranking, best[1], grounding, perf_counter() - began)
 
-    def _borne_out(self, goals: Sequence[_State], look: _Look) -> tuple[_State, tuple[Rollout, ...]] | None:
+    def _borne_out(
+        self, goals: Sequence[_State], look: tuple[Rollout, Grounding, Wanted]
+    ) -> tuple[_State, tuple[Rollout, ...]] | None:
         """Of goal states of one length the first whose films end in the goal, too, and these; None if there is none."""
         if not goals or not self.checked:
             return (goals[0], goals[0].rollouts()) if goals else None
         goals = sorted(goals, key=lambda one: one.away)[: self.checked]
-        films: list[Rollout] = []
+        (parsed, grounding, wanted), films = look, list[Rollout]()
         for step in range(len(goals[0].instructions)):
             texts = [one.instructions[step].text for one in goals]
-            before = films[-1].last if films else look.parsed.select([0] * len(goals))
+            before = films[-1].last if films else parsed.select([0] * len(goals))
             horizon = self.world_model.longest_horizon or HORIZON
             films.append(self.world_model.rollout(before, texts, horizon=horizon, seed=self.seed))
-        ends_BG = look.wanted.ratios(places(films[-1], look.grounding, look.things))
+        ends_BG = wanted.ratios(places(films[-1], grounding, sorted(grounding.things)))
         for row in torch.nonzero((ends_BG <= 1).all(1)).flatten().tolist():
             return goals[row], tuple(film.select(row) for film in films)
         return None
