@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
@@ -29,14 +27,15 @@ from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.judge import imagine_and_trace, judge
-from experiments.study.mask_metrics import labels_of, score_masks
+from experiments.study.mask_metrics import score_masks
 from experiments.study.methods import HORIZON, Model, lines
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import Prediction
+from experiments.study.predictions import Prediction, to_tensor
 from experiments.study.run import Found, Part, Run, Study, StudyArgs, start
 from experiments.study.scenes import StudyScene, play_expert, sample_scene, study_scenes
 from planning import AppearanceGrounder
 from textocvp.checkpoint import CONFIG_FILE, WEIGHTS_FILE
+from textocvp.metrics import slot_labels
 from textocvp.metrics.frames import psnr
 from textocvp.protocols import LoadModel
 from textocvp.training.evaluate_predictor import PIXEL, REACHED
@@ -87,10 +86,6 @@ class Entrant:
     load: LoadModel | None = None  # makes it; None for the study's own
     num_slots: int | None = None  # that its parser uses, background included; None for its own number
 
-    def model(self, worker: Worker) -> Any:
-        """The model, in a process."""
-        return worker.world_model if self.load is None else worker.model(self.load)
-
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
@@ -117,14 +112,14 @@ class FollowingScene:
         seen_1HW3, ground = sampled.observation["rgb"][None], AppearanceGrounder.from_info(sampled.info)
         scorer = None
         if self.measures is not None:
-            real_T3HW = _to_tensor(play_expert(env, sampled).frames[: LENGTH + 1])
+            real_T3HW = to_tensor(play_expert(env, sampled).frames[: LENGTH + 1])
             scorer = Scorer(real_T3HW, self.measures, upper=False)
         figures: dict[tuple[str, str, str], Any] = {}
         for one in self.entrants:
             with warnings.catch_warnings():
                 # That a text encoder has never met a colour's name is what the unseen colours are about.
                 warnings.filterwarnings("ignore", "the text encoder has never met", UserWarning)
-                model = one.model(worker)
+                model = worker.model(one.load)
                 parsed = model.parse(seen_1HW3, seed=self.seed, num_slots=one.num_slots)
                 rollout, ours, wrong = imagine_and_trace(model, parsed, ground, sampled.texts, self.seed)
             (success_V, miss_V), (_, wrong_miss_V) = (
@@ -158,17 +153,13 @@ class ParsingScene:
         played = play_expert(env, sampled)
         figures = {}
         for one in self.entrants:
-            parsed = one.model(worker).parse(played.frames, seed=self.seed, num_slots=one.num_slots)
-            scores = score_masks(labels_of(parsed)[0], played.segmentations, sampled.named_block)
+            parsed = worker.model(one.load).parse(played.frames, seed=self.seed, num_slots=one.num_slots)
+            scores = score_masks(slot_labels(parsed.masks[0]), played.segmentations, sampled.named_block)
             for metric, curve in (("miou", scores.iou), ("kept", scores.kept), ("ari", scores.ari)):
                 figures[one.name, "true frames", metric] = float(np.nanmean(curve))
-            redrawn_T = psnr(parsed.frames[0], _to_tensor(played.frames))
+            redrawn_T = psnr(parsed.frames[0], to_tensor(played.frames))
             figures[one.name, "true frames", "psnr"] = float(redrawn_T.mean())
         return Outcome(self.scene, figures)
-
-
-def _to_tensor(frames_THW3: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(frames_THW3)).permute(0, 3, 1, 2).float() / 255
 
 
 def entrants(run: Run, stage: str) -> tuple[Entrant, ...]:

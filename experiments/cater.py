@@ -18,7 +18,6 @@ from itertools import product
 from typing import Any, cast
 
 import numpy as np
-import torch
 
 from envs.cater import Clip as Actions
 from experiments.report.gif import gif
@@ -26,14 +25,14 @@ from experiments.report.page import CardSpec, Clip, Clips, Section
 from experiments.report.results import Results
 from experiments.report.rows import Key, Row, figure_rows
 from experiments.report.tables import Column, Paper, TableSpec, quoted
-from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns, reach
+from experiments.study.any_size import Film, Seen, compare, drawn, fitted, imagine, length_columns
 from experiments.study.attention import glow
 from experiments.study.cater import SIDE, CaterScene, Judged, cater_scenes, judge, slide_away, slots_of_things
 from experiments.study.clips import extreme_clips
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import Model, lines, with_paper
 from experiments.study.pool import Unit, Worker
-from experiments.study.predictions import hold_last, to_uint8
+from experiments.study.predictions import hold_last, reach, to_tensor, to_uint8
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from textocvp.data.episodes import Episode, EpisodeObject
 from textocvp.pictures import captioned, enlarge
@@ -104,7 +103,7 @@ class CaterUnit:
         films = {one.clip(): one.watch(SIDE) for one in (self.scene, *others)}
         truth = as_episode(clip, *films[clip])
         first, T = truth.frames[0], len(truth.frames)
-        real_T3HW = torch.from_numpy(truth.frames).permute(0, 3, 1, 2).float() / 255
+        real_T3HW = to_tensor(truth.frames)
         scorer = Scorer(real_T3HW, self.measures, upper=False)
         figures: dict[tuple[str, str, str], Any] = {}
         happened = {asked: judge(labels, asked, labels[0]) for asked, (_, labels) in films.items()}

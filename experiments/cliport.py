@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 
 from envs.tasks.base import CLIPORT_RADIUS
 from experiments.report.page import CardSpec, Clips, Section
@@ -35,6 +34,7 @@ from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
 from experiments.study.methods import HORIZON, METHODS, Method, Model, lines, with_paper
 from experiments.study.pool import Unit, Worker
+from experiments.study.predictions import to_tensor
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
 from experiments.study.scenes import StudyScene, study_scenes
 from planning import THRESHOLDS, BeamPlanner, Goal, Imagines, Instruction, LiteralController, Planner, RandomPlanner
@@ -137,10 +137,7 @@ class Sizes:
 class CliportLoop(LoopEpisode):
     """A unit of work: one of `PLAYERS`, one scene."""
 
-    @property
-    def acts(self) -> Method:
-        """Who acts."""
-        return PLAYERS[self.method]
+    methods = PLAYERS
 
 
 # --- episodes ---------------------------------------------------------------------------------------------------------
@@ -208,7 +205,7 @@ class EpisodeUnit:
         truth, ours = read(self.source, worker), worker.world_model
         asked = Instruction.parse(truth.instruction)
         others, wrong = other_sentences(truth, asked)
-        real_T3HW = torch.from_numpy(truth.frames).permute(0, 3, 1, 2).float() / 255
+        real_T3HW = to_tensor(truth.frames)
         T, side = len(truth.frames), truth.frames.shape[1]
         scorer = Scorer(real_T3HW, self.measures, upper=False)
         figures: dict[tuple[str, str, str], float] = {}

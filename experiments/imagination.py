@@ -163,7 +163,7 @@ class Episode(LoopEpisode):
         """Plan and act; see `run_episode`."""
         searcher = self.searcher
         assert searcher.plan is not None
-        model = worker.world_model if self.load is None else worker.model(self.load)
+        model = worker.model(self.load)
         return run_episode(
             env,
             searcher.plan(foresight(model), self.scene.seed),

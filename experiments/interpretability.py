@@ -38,6 +38,7 @@ from experiments.study.attention import (
 )
 from experiments.study.clips import extremes_by_scene, tone
 from experiments.study.judge import find_things
+from experiments.study.mask_metrics import mean_known
 from experiments.study.pool import Worker
 from experiments.study.predictions import to_uint8
 from experiments.study.run import Found, Part, Run, Study, UsageError, start
@@ -317,11 +318,6 @@ def page(run: Run, results: Results, found: Found) -> list[Section]:
 
 
 SHORT_WORDS = [word.replace("'s colour", "\ncolour") for word in TEMPLATE]
-
-
-def mean_known(values: Any) -> np.ndarray:
-    """Over the first axis; nan where nothing is known."""
-    return np.asarray(np.ma.masked_invalid(values).mean(0).filled(np.nan))
 
 
 def curves(readings: Sequence[Sequence[AttentionReading]]) -> list[Figure]:

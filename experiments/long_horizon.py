@@ -130,10 +130,7 @@ def taken_scene(seed: int) -> StudyScene:
 class LongEpisode(LoopEpisode):
     """A unit of work: one line of the tables, one scene."""
 
-    @property
-    def acts(self) -> Method:
-        """Who acts."""
-        return LINES[self.method]
+    methods = LINES
 
     def order(self, goal: Goal) -> tuple[str, ...]:
         """What the expert does: an order that works, unless it shall keep to the sentence's."""

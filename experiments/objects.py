@@ -22,13 +22,14 @@ from experiments.report.results import Results
 from experiments.report.rows import Key, Row, mean_row
 from experiments.report.tables import Column, Line, TableSpec
 from experiments.study.clips import PredictionClip, extreme_clips
-from experiments.study.mask_metrics import MaskScores, labels_of, score_masks
+from experiments.study.mask_metrics import MaskScores, mean_known, score_masks
 from experiments.study.methods import HORIZON, METHODS, OURS_40, TRAINED_LITTLE, Model, lines
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import hold_last, predict, to_uint8
 from experiments.study.run import Found, Part, Run, Study, start
 from experiments.study.scenes import StudyScene, study_scenes
 from planning import Instruction, SegmentationGrounder
+from textocvp.metrics import slot_labels
 
 SPLIT = "test"
 FARTHEST = 40  # predicted frames, for models that can look as far
@@ -72,7 +73,7 @@ class ObjectScene:
     def run(self, worker: Worker) -> Mapping[str, MaskScores]:
         """Imagine it, play it, compare."""
         truth, predictions = predict(worker, self.scene, self.models, horizon=FARTHEST, seed=self.seed)
-        labels = {one.method: labels_of(one.rollout)[0] for one in predictions if one.rollout is not None}
+        labels = {one.method: slot_labels(one.rollout.masks[0]) for one in predictions if one.rollout is not None}
         longest = max(map(len, labels.values()))
         labels["copy seed"] = hold_last(labels["ours"][:1], longest)
         labels["true frames"] = hold_last(labels["true frames"], longest)
@@ -147,7 +148,7 @@ def method_rows(found: Outcomes, metrics: Iterable[str], lengths: Sequence[int] 
     for line, metric in product(LINES, metrics):
         curves_NT = _predicted(found, line.key, metric)
         for n in (n for n in lengths if n <= curves_NT.shape[1]):
-            means_N, alone_N = _means(curves_NT[:, :n]), curves_NT[:, n - 1]
+            means_N, alone_N = mean_known(curves_NT[:, :n], axis=1), curves_NT[:, n - 1]
             for variant, values_N in ((f"frames 1-{n}", means_N), (f"frame {n}", alone_N)):
                 if not np.isnan(values_N).all():  # something was seen
                     made.append(mean_row(line.key, SPLIT, variant, metric, values_N))
@@ -160,7 +161,7 @@ def difference_rows(found: Outcomes) -> list[Row]:
     for method, metric in product(OTHERS, ("iou", "iou_moving")):
         ours, other = (_predicted(found, one, metric) for one in ("ours", method))
         for n in (n for n in LENGTHS if n <= min(ours.shape[1], other.shape[1])):
-            values_N = _means(ours[:, :n]) - _means(other[:, :n])
+            values_N = mean_known(ours[:, :n], axis=1) - mean_known(other[:, :n], axis=1)
             made.append(mean_row(f"ours minus {method}", SPLIT, f"frames 1-{n}", metric, values_N))
     return made
 
@@ -169,11 +170,6 @@ def _predicted(found: Outcomes, method: str, metric: str) -> np.ndarray:
     """(N, T) a metric of every scene in every predicted frame; T is 0 for a method that was not measured."""
     curves = [getattr(scores[method], METRICS[metric][0])[1:] for scores in found if method in scores]
     return np.stack(curves) if curves else np.empty((0, 0))
-
-
-def _means(curves_NT: np.ndarray) -> np.ndarray:
-    """Mean over the frames in which there was something to see."""
-    return np.ma.masked_invalid(curves_NT).mean(axis=1).filled(np.nan)
 
 
 def headline(run: Run) -> dict[str, Key]:

@@ -25,7 +25,7 @@ from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, PERCEPTUAL, Measures, Scorer
 from experiments.study.frame_metrics import available_measures as available
 from experiments.study.judge import judge_rollout
-from experiments.study.mask_metrics import labels_of, score_masks
+from experiments.study.mask_metrics import score_masks
 from experiments.study.methods import BASELINES, HORIZON, METHODS, PLANNERS, TRAINED_LITTLE, Model, lines
 from experiments.study.pictures import CHANGES, WORDS, ChangedScene, change_rows, change_tables
 from experiments.study.pool import Unit, Worker
@@ -34,6 +34,7 @@ from experiments.study.run import Found, Part, Run, ScenesArgs, Study, start
 from experiments.study.scenes import StudyScene, place_of, scene_hash, study_scenes
 from experiments.study.wordings import FREE
 from planning import AppearanceGrounder
+from textocvp.metrics import slot_labels
 from textocvp.metrics.intervals import Interval, ratio_interval, relative_change, wilson_interval
 
 SPLITS = {"test": "test set", "unseen_colors": "unseen colours", "more_objects": "8 objects"}
@@ -127,7 +128,7 @@ class RobustScene:
         # Ours once more, judged as the models without slots must be: our parser reads the masks off its frames.
         for one in [*predictions, Prediction(REPARSED, predictions[0].frames_T3HW)]:
             rollout = slots_of(worker, one, self.seed)
-            labels_THW = labels_of(rollout)[0]
+            labels_THW = slot_labels(rollout.masks[0])
             true_THW = truth.segmentations_THW[: len(labels_THW)]
             scores = score_masks(labels_THW, true_THW, truth.sampled.named_block)
             curves.setdefault(one.method, {})["iou"] = scores.iou[1:]

@@ -16,7 +16,7 @@ from experiments.report.page import Clip
 from experiments.report.tables import Column
 from experiments.study.frame_metrics import METRICS, Scorer
 from experiments.study.pool import Worker
-from experiments.study.predictions import Prediction, hold_last, to_uint8
+from experiments.study.predictions import Prediction, hold_last, reach, to_uint8
 from textocvp.data.episodes import Episode
 from textocvp.metrics import foreground_ari, object_ious
 from textocvp.rollout import Rollout
@@ -44,11 +44,6 @@ def fitted(frames: np.ndarray, model: Any) -> np.ndarray:
     flat = map(Image.fromarray, frames.reshape(-1, *frames.shape[-3:]))
     small = [np.asarray(one.resize((own, own), Image.Resampling.BOX)) for one in flat]
     return np.stack(small).reshape(*frames.shape[:-3], own, own, 3)
-
-
-def reach(model: Any, horizon: int) -> int:
-    """So many frames, or as many as the model can imagine at once."""
-    return min(horizon, model.longest_horizon or horizon)
 
 
 def enlarged(pictures_NCHW: Tensor, side: int) -> Tensor:

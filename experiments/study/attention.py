@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from experiments.study.methods import HORIZON
+from experiments.study.predictions import reach
 from experiments.study.run import UsageError
 from planning import RELATIONS, Grounding, Instruction
 from textocvp import Rollout, WorldModel
@@ -139,8 +140,7 @@ def without_color_term(model: object) -> WorldModel | None:
 
 def imagine(model: WorldModel, parsed: Rollout, texts: Sequence[str], seed: int) -> tuple[list[np.ndarray], Rollout]:
     """Imagine, and merge each rollout's attention (T, n, h, K, W) to the words of `TEMPLATE`."""
-    horizon = min(HORIZON, model.longest_horizon or HORIZON)
-    rollout = model.rollout(parsed, list(texts), horizon=horizon, seed=seed, attention=True)
+    rollout = model.rollout(parsed, list(texts), horizon=reach(model, HORIZON), seed=seed, attention=True)
     assert rollout.attention is not None  # `check_model` saw to it
     pairs = zip(rollout.attention.cpu().double().numpy(), texts, strict=True)
     return [merge_tokens(attention, model.words(text), text) for attention, text in pairs], rollout

@@ -10,11 +10,11 @@ from experiments.report.gif import gif, paint, segmentation_colors, slot_colors
 from experiments.report.page import Clip, Tone
 from experiments.study.any_size import Film
 from experiments.study.closed_loop import LoopEpisode, LoopOutcome
-from experiments.study.mask_metrics import labels_of
 from experiments.study.methods import HORIZON, Model
 from experiments.study.pool import Worker
 from experiments.study.predictions import predict, slots_of, to_uint8
 from experiments.study.scenes import StudyScene, sample_scene
+from textocvp.metrics import slot_labels
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PredictionClip:
         masks = [paint(truth.segmentations_THW, segmentation_colors(objects))]
         for one in predictions:
             rollout = slots_of(worker, one, self.seed)
-            labels_THW = labels_of(rollout)[0]
+            labels_THW = slot_labels(rollout.masks[0])
             colors = slot_colors(labels_THW[0], info["segmentation"], rollout.slots.shape[2], objects)
             masks.append(paint(labels_THW, colors))
         frames = [truth.frames_THW3, *(to_uint8(one.frames_T3HW) for one in predictions)]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import fmean
-from typing import Any, cast
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from planning import (
     AppearanceGrounder,
     Controller,
     EpisodeResult,
-    Foresees,
     Goal,
     LiteralController,
     PinholeCamera,
@@ -78,6 +77,7 @@ class LoopOutcome:
 class LoopEpisode:
     """A unit of work: one method, one scene, one goal."""
 
+    methods: ClassVar[Mapping[str, Method]] = METHODS  # who can act, by key
     method: str  # key of who acts
     scene: StudyScene  # where
     variant: int = 0  # 0 for the scene's own instruction, i for its i-th variant with another target bowl
@@ -88,7 +88,7 @@ class LoopEpisode:
     @property
     def acts(self) -> Method:
         """Who acts."""
-        return METHODS[self.method]
+        return self.methods[self.method]
 
     @property
     def who(self) -> str:
@@ -122,13 +122,13 @@ class LoopEpisode:
     def pursue(self, worker: Worker, sampled: SampledScene) -> EpisodeResult:
         """Plan and act until the goal is believed to be reached, or the attempts are used up."""
         goal, method = Goal.parse(sampled.texts[self.variant]), self.acts
-        world_model = worker.world_model if self.load is None else worker.model(self.load)
+        world_model = worker.model(self.load)
         # Seeded by scene and variant too: one stream for all episodes would depend on their order.
         rng = np.random.default_rng([self.seed, self.scene.seed, self.variant or method.chance])
         assert method.plan is not None
         controller: Callable[[PinholeCamera], Controller | LiteralController] = method.controller
         if controller is Controller and getattr(world_model, "foresees", False):
-            controller = partial(Controller, outcome=cast(Foresees, world_model).outcome)
+            controller = partial(Controller, outcome=world_model.outcome)
         return run_episode(
             worker.environment(self.scene),
             method.plan(world_model, goal, rng, self.seed),

@@ -139,7 +139,7 @@ class Foresight:
         env = worker.environment(self.scene, record=False)
         observation, info = env.reset(seed=self.scene.seed, options=dict(self.scene.options))
         base, rng = cast(TabletopEnv, env.unwrapped), np.random.default_rng([self.seed, self.scene.seed])
-        model = foresight(worker.world_model if self.load is None else worker.model(self.load))
+        model = foresight(worker.model(self.load))
         task = cast(Rearrange, base.task)
         right: dict[str, list[bool]] = {case: [] for case in CASES}
         for _ in range(SENTENCES):

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from textocvp import Rollout
-from textocvp.metrics import foreground_ari, object_ious, overlaps, slot_labels
+from textocvp.metrics import foreground_ari, object_ious, overlaps
 
 BACKGROUND, ARM = 0, 1  # their labels in a segmentation
 
@@ -73,6 +73,6 @@ def _mean(values: object) -> float:
     return float(array.mean()) if len(array) else float("nan")
 
 
-def labels_of(rollout: Rollout) -> np.ndarray:
-    """The slot that wins each pixel, (B, T, H, W)."""
-    return slot_labels(rollout.masks)
+def mean_known(values: Any, axis: int = 0) -> np.ndarray:
+    """Over an axis; nan where nothing is known."""
+    return np.asarray(np.ma.masked_invalid(values).mean(axis).filled(np.nan))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from experiments.report.rows import Row, rate_row
+from experiments.report.rows import Row, figure_rows
 from experiments.report.tables import TableSpec, columns
 from experiments.study.methods import HORIZON, lines
 from experiments.study.pool import Worker
@@ -124,14 +124,10 @@ def _best_slot(seen_HW: NDArray[np.int64], labels_HW: NDArray[np.uint8], label: 
 
 def change_rows(outcomes: Sequence[ChangedOutcome]) -> list[Row]:
     """For each wording, split and change the share of scenes that reach the bowl, and the share that is warned of."""
-    found: dict[tuple[str, str, str], list[ChangedOutcome]] = {}
-    for one in outcomes:
-        found.setdefault((one.words, one.scene.split, one.change), []).append(one)
-    return [
-        rate_row(*place, metric, [getattr(one, metric) for one in its])
-        for place, its in found.items()
-        for metric in ("reached", "warned")
-    ]
+    return figure_rows(
+        (one.scene.split, {(one.words, one.change, metric): getattr(one, metric) for metric in ("reached", "warned")})
+        for one in outcomes
+    )
 
 
 def change_tables(split: str) -> list[TableSpec]:

@@ -1,6 +1,6 @@
 """Work units on several processes, with results in order."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -8,15 +8,12 @@ from typing import Any, Protocol, TypeVar
 import gymnasium as gym
 import torch
 from joblib import Parallel, delayed
-from joblib import cpu_count as available_cores  # noqa: F401 - for the studies
 
 from experiments.study.scenes import StudyScene
-from textocvp.protocols import LoadCheckpoint as LoadCheckpoint
 from textocvp.protocols import LoadModel
 from textocvp.world_model import WorldModel
 
 Out = TypeVar("Out", covariant=True)
-Model = TypeVar("Model")
 
 
 @dataclass
@@ -25,14 +22,15 @@ class Worker:
 
     world_model: WorldModel  # the study's own
     _environments: dict[Any, gym.Env[Any, Any]] = field(default_factory=dict)
-    _models: dict[Callable[[], Any], Any] = field(default_factory=dict)
+    _models: dict[LoadModel, Any] = field(default_factory=dict)
 
-    def model(self, load: Callable[[], Model]) -> Model:
-        """Another model, as a baseline. `load` must be hashable."""
+    def model(self, load: LoadModel | None) -> Any:
+        """Another model, as a baseline; the study's own for None. `load` must be hashable."""
+        if load is None:
+            return self.world_model
         if load not in self._models:
             self._models[load] = load()
-        model: Model = self._models[load]
-        return model
+        return self._models[load]
 
     def environment(self, scene: StudyScene, record: bool = True) -> gym.Env[Any, Any]:
         """The environment of a scene. Building it takes longer than resetting it, so it is kept."""

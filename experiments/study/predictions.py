@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from experiments.study.methods import Model
 from experiments.study.pool import Worker
 from experiments.study.scenes import SampledScene, StudyScene, play_expert, sample_scene, wrong_text
-from textocvp import Rollout, WorldModel
+from textocvp import Rollout
 
 Video = TypeVar("Video", np.ndarray, Tensor)
 
@@ -29,7 +29,7 @@ class GroundTruth:
     @property
     def frames_T3HW(self) -> Tensor:
         """The frames in 0..1."""
-        return torch.from_numpy(self.frames_THW3).permute(0, 3, 1, 2).float() / 255
+        return to_tensor(self.frames_THW3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def predict(
     sampled = sample_scene(env, scene, variants)
     text, wrong = sampled.texts[variant], wrong_text(sampled)
     ours, seen = worker.world_model, sampled.observation["rgb"]
-    both = ours.rollout(seen, [text, wrong], horizon=_ahead(ours.longest_horizon, horizon), seed=seed)
+    both = ours.rollout(seen, [text, wrong], horizon=reach(ours, horizon), seed=seed)
     right, other = both.select(0), both.select(1)
     predictions = [Prediction("ours", right.frames[0], right)]
     predictions += [_predict_one(worker, model, seen, text, horizon, seed) for model in models]
@@ -91,10 +91,11 @@ def predict(
 
 
 def _predict_one(worker: Worker, model: Model, seen: np.ndarray, text: str, horizon: int, seed: int) -> Prediction:
-    made, ahead = worker.model(model.load), _ahead(model.longest, horizon)
+    made = worker.model(model.load)
+    ahead = reach(made, horizon)
     if not model.slots:
         return Prediction(model.key, made.imagine(seen, [text], horizon=ahead, seed=seed)[0].float().cpu())
-    rollout = cast(WorldModel, made).rollout(seen, [text], horizon=ahead, seed=seed)
+    rollout = made.rollout(seen, [text], horizon=ahead, seed=seed)
     return Prediction(model.key, rollout.frames[0], rollout)
 
 
@@ -115,5 +116,11 @@ def hold_last(frames: Video, count: int) -> Video:
     return frames[np.minimum(np.arange(count), len(frames) - 1)]
 
 
-def _ahead(longest: int | None, asked: int) -> int:
-    return asked if longest is None else min(longest, asked)
+def to_tensor(frames_THW3: np.ndarray) -> Tensor:
+    """The inverse of `to_uint8`."""
+    return torch.from_numpy(frames_THW3).permute(0, 3, 1, 2).float() / 255
+
+
+def reach(model: Any, horizon: int) -> int:
+    """So many frames, or as many as the model can imagine at once."""
+    return min(horizon, model.longest_horizon or horizon)

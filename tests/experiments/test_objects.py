@@ -12,13 +12,14 @@ import pytest
 from experiments.objects import STUDY, ObjectScene, Sizes, cases, method_rows
 from experiments.study.mask_metrics import MaskScores, score_masks
 from experiments.study.methods import METHODS, OURS_40, Model, find_models
-from experiments.study.pool import LoadCheckpoint, Worker
+from experiments.study.pool import Worker
 from experiments.study.run import Run, StudyArgs, run
 from experiments.study.scenes import sample_scene, study_scenes, wrong_text
 from planning import Instruction
 from tests.experiments.foresight import LoadForesight
 from tests.experiments.oracle import LoadOracle
 from textocvp.checkpoint import CheckpointError
+from textocvp.protocols import LoadCheckpoint
 
 FIELDS = list(MaskScores.__dataclass_fields__)
 

@@ -11,7 +11,7 @@ from envs import Expert
 from experiments.study.clips import PredictionClip, extreme_clips
 from experiments.study.frame_metrics import BOTTOM_ROWS, PSNR_CAP, UPPER, Measures, Scorer
 from experiments.study.methods import METHODS, Model, find_models
-from experiments.study.pool import LoadCheckpoint, Worker
+from experiments.study.pool import Worker
 from experiments.study.predictions import Prediction, predict, slots_of
 from experiments.study.scenes import study_scenes
 from tests.experiments.oracle import LoadOracle
@@ -19,6 +19,7 @@ from tests.experiments.still import LoadStill
 from textocvp.checkpoint import CheckpointError
 from textocvp.metrics.frames import psnr
 from textocvp.metrics.perceptual import load_st_lpips
+from textocvp.protocols import LoadCheckpoint
 
 MEASURES = Measures(("st_lpips",))
 
