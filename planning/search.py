@@ -234,7 +234,8 @@ class SearchPlanner:
         if not goals or not self.checked:
             return (goals[0], goals[0].rollouts()) if goals else None
         goals = sorted(goals, key=lambda one: one.away)[: self.checked]
-        (parsed, grounding, wanted), films = look, list[Rollout]()
+        parsed, grounding, wanted = look
+        films: list[Rollout] = []
         for step in range(len(goals[0].instructions)):
             texts = [one.instructions[step].text for one in goals]
             before = films[-1].last if films else parsed.select([0] * len(goals))
