@@ -286,10 +286,13 @@ def cases(run: Run, found: Found) -> dict[str, Sequence[Unit]]:
 def rows(run: Run, found: Found) -> list[Row]:
     """Every figure over all episodes and over each split; how many there are; the closed loop."""
     made = figure_rows(
-        (place, {key: value})
-        for split, figures in found["episodes"]
-        for key, value in figures.items()
-        for place in dict.fromkeys((ALL, split))
+        [
+            (place, {key: value})
+            for split, figures in found["episodes"]
+            for key, value in figures.items()
+            for place in dict.fromkeys((ALL, split))
+        ],
+        rates={"success"},
     )
     if n := len(found["episodes"]):
         made.append(Row("episodes", ALL, ALL, "n", n, n, n, n))

@@ -1,7 +1,7 @@
 """Cameras: presets, and the matrices that take a world point to a pixel."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import cos, radians, sin, tan
 
 import numpy as np
@@ -66,12 +66,12 @@ class Camera:
         in_image = in_camera @ self.intrinsics.T
         return in_image[..., :2] / in_image[..., 2:]
 
-    @property
+    @cached_property
     def view_matrix(self) -> list[float]:
         """OpenGL's view matrix (x right, y up, z backward), column-major, as PyBullet takes it."""
         return (np.diag([1.0, -1.0, -1.0, 1.0]) @ self.extrinsics).T.ravel().tolist()
 
-    @property
+    @cached_property
     def projection_matrix(self) -> list[float]:
         """OpenGL's projection matrix, column-major."""
         near, far = self.preset.near, self.preset.far

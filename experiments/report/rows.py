@@ -1,7 +1,7 @@
 """A measured figure with its interval. Scenes are independent; slot seeds and variants of one scene are not."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,15 +89,20 @@ def pick_figures(rows: Iterable[Row], wanted: Mapping[str, Key]) -> dict[str, fl
     return {name: round(found[key].value, 4) for name, key in wanted.items() if key in found}
 
 
-def figure_rows(scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]]) -> list[Row]:
-    """A row for each figure of each split: of truth values and of success a rate, of other numbers a mean.
+def figure_rows(
+    scenes: Iterable[tuple[str, Mapping[tuple[str, str, str], Any]]], rates: Collection[str] = ()
+) -> list[Row]:
+    """A row for each figure of each split: of truth values a rate, of numbers a mean.
 
     Args:
         scenes: the split of each and its figures: (method, variant, metric) -> a number, or one or more truth values.
+        rates: metrics of which a scene's number is the share that came true.
     """
     values: dict[Key, list[Any]] = {}
     for split, figures in scenes:
         for (method, variant, metric), value in figures.items():
             values.setdefault((method, split, variant, metric), []).append(value)
-    rates = {key: key[3].endswith("success") or np.asarray(its).dtype == bool for key, its in values.items()}
-    return [(rate_row if rates[key] else mean_row)(*key, its) for key, its in values.items()]
+    return [
+        (rate_row if key[3] in rates or np.asarray(its).dtype == bool else mean_row)(*key, its)
+        for key, its in values.items()
+    ]

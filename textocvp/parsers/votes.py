@@ -29,6 +29,7 @@ REACH = 8.0  # pixels in which votes are written: an object's radius or so
 SIZE_UNIT = 12.0  # of the logarithm of an object's radius, in pixels: a bowl and the block in it must lie apart
 SMALLEST = 14.3  # in that unit: smaller radii are alike, for a half hidden block is one block, not two
 VOTE_SPREAD = 1.2  # pixels by which votes of one object may differ
+LEAST_EXPONENT = -40.0  # of how near two votes are
 MIN_SHARE = 0.12  # of the votes that a square of an object's size would have, at least
 MOST_VOTES = 1000  # of a frame that are compared with each other
 MIN_AREA = 4  # pixels of an object, at least
@@ -198,10 +199,9 @@ def count_votes(
     votes_L3 = votes_3HW[:, y_L, x_L].T + torch.stack([x_L, y_L, 0 * x_L], 1)
     some_S3 = votes_L3[:: 1 + len(votes_L3) // MOST_VOTES]
     near_SS = _apart(some_S3, some_S3)
-    exponent_SS = (-near_SS.square() / (2 * VOTE_SPREAD**2)).clamp_min(
-        -40.0
-    )  # beyond, CPUs are slow and nothing is added
-    density_S = exponent_SS.exp().sum(1) * len(votes_L3) / max(1, len(some_S3))
+    # What is farther apart adds nothing, and CPUs are slow where `exp` all but vanishes.
+    kernel_SS = (-near_SS.square() / (2 * VOTE_SPREAD**2)).clamp_min(LEAST_EXPONENT).exp()
+    density_S = kernel_SS.sum(1) * len(votes_L3) / max(1, len(some_S3))
     # Large objects need more votes: else the stray ones of their borders would be objects of their own.
     enough_S = (MIN_SHARE * _pixels_of(some_S3)).clamp_min(min_votes)
     density_S = density_S.masked_fill(density_S < enough_S, 0.0)
@@ -243,6 +243,7 @@ def follow(
     position_P2, scale_P2 = (values[0] for values in moments(masks_PHW[None]))
     mass_P1 = masks_PHW.sum((1, 2))[:, None].clamp_min(1)
     hue_P4 = color_features(masks_PHW.flatten(1) @ frame_3HW.flatten(1).T / mass_P1)
+    area_P = mass_P1[:, 0].cpu().numpy()
 
     reach_K1 = 3 * state.scale.mean(-1, keepdim=True) + SEARCH
     off_KP = torch.cdist(state.position + speed_K2, position_P2) / reach_K1
@@ -252,8 +253,7 @@ def follow(
     used, free = (FIRST_THING + np.flatnonzero(which) for which in (used_K[FIRST_THING:], ~used_K[FIRST_THING:]))
     cost_UP = (cost_KP + SIZE_COST * size_KP).cpu().numpy()[used].clip(max=MOST_COST)
     # What is matched is what explains the most pixels: else a tool's tip could turn a thing away from its own.
-    gain_UP = (MOST_COST - cost_UP) * mass_P1[:, 0].cpu().numpy()
-    rows, columns = scipy.optimize.linear_sum_assignment(gain_UP, maximize=True)
+    rows, columns = scipy.optimize.linear_sum_assignment((MOST_COST - cost_UP) * area_P, maximize=True)
     sure = cost_UP[rows, columns] < MOST_COST
     owner_P = np.zeros(P, int)
     owner_P[columns[sure]] = used[rows[sure]]
@@ -263,11 +263,13 @@ def follow(
     if pieces.any():
         owner_P[rest[pieces]] = used[cost_UP[:, rest[pieces]].argmin(0)]
     new = rest[~pieces]  # all in the first frame, when no slot is used
-    around_HW = F.max_pool2d(robot_HW[None].float(), 2 * TOUCHES + 1, 1, TOUCHES)[0]
-    scrap_P = (mass_P1[:, 0] < LATE_AREA).cpu().numpy()
-    touches_P = (masks_PHW * around_HW).amax((1, 2)).bool().cpu().numpy()
-    owner_P[new[(scrap_P & touches_P)[new]]] = ROBOT_SLOT  # its tool has other colours
-    new = new[~(scrap_P & (touches_P | bool(len(used))))[new]][: len(free)]
+    small = area_P[new] < LATE_AREA
+    if small.any():
+        around_HW = F.max_pool2d(robot_HW[None].float(), 2 * TOUCHES + 1, 1, TOUCHES)[0]
+        touches = (masks_PHW[new] * around_HW).amax((1, 2)).bool().cpu().numpy()
+        owner_P[new[small & touches]] = ROBOT_SLOT  # its tool has other colours
+        new = new[~small if len(used) else ~(small & touches)]
+    new = new[: len(free)]
     owner_P[new] = free[: len(new)]
 
     # A thing that has no peak may stand where it stood, beside a larger one: it keeps the votes nearest to it.
