@@ -96,7 +96,7 @@ PRESETS = {
         ModelConfig("cliport", VotesConfig(image_size=168, num_slots=12), CarryConfig(), SMALL_TEXT,
                     replace(SMALL, color_bias=True, window=56)),
         # CATER-hard on CPUs: background, a place for a robot that is not there, at most 8 things, and one to spare.
-        ModelConfig("cater", VotesConfig(num_slots=11, peak_radius=3.0, memory=False), RecallConfig(),
+        ModelConfig("cater", VotesConfig(num_slots=11, peak_radius=3.0), RecallConfig(),
                     WordsConfig(kind="transformer"), replace(SMALL, window=29, appearance=True)),
         ModelConfig("ocvp-seq-small", PlacedConfig(), GlimpseConfig(), SMALL_TEXT, SMALL_SEQ),
         ModelConfig("ocvp-seq", PUBLISHED_SAVI, BroadcastConfig(), PUBLISHED_TEXT, PUBLISHED_SEQ),

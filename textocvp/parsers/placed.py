@@ -123,7 +123,8 @@ class PlacedCorrector(nn.Module):
         luminance_B1HW = ((frames + 1) / 2).mean(1, keepdim=True)
         own_BK11 = ((color + 1) / 2).mean(-1)[..., None, None]
         shading_BKHW = attention * (luminance_B1HW / own_BK11.clamp_min(0.05) - 1).clamp(-1, 2)
-        return crop(torch.stack([attention, shading_BKHW], dim=2), position, scale, self.cells, self.extent)
+        parts = [crop(x[:, :, None], position, scale, self.cells, self.extent) for x in (attention, shading_BKHW)]
+        return torch.cat(parts, dim=2)
 
 
 class PlacedTransition(nn.Module):

@@ -52,9 +52,10 @@ class ParserTraining(ClipTraining):
 
     start: Path | None = None
     """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips."""
-    keep_rest: bool = False
-    """Only the network of a parser that is taught goes on learning to see; all else of `start` stays, its predictor,
-    too."""
+    only: Literal["all", "sight", "renderer"] = "all"
+    """What of `start` goes on learning: `sight`, the network of a parser that is taught, or the `renderer`; all else
+    stays as it is, a predictor, too. With `all` parser and renderer begin with its weights, and there is no
+    predictor."""
 
 
 class ParserStage(nn.Module):
@@ -123,16 +124,16 @@ def train(args: ParserTraining) -> ParserMetrics | None:
         CacheError: if `out` holds features of another encoder or of other episodes.
     """
     # On single frames the transition takes no part, and before the first redraw nothing but the lesson.
-    some_unused = args.clip == 1 or args.first_redraw > 0 or args.keep_rest
+    some_unused = args.clip == 1 or args.first_redraw > 0 or args.only == "sight"
     accelerator = open_run(args.out, args.precision, some_unused=some_unused)
     torch.manual_seed(args.seed)
     with allowed_settings():
         config = replace(with_settings(preset(args.preset), args.set), stage="parser")
         model = TextOCVP(config)
-    learns = model.parser.taught and args.taught is None
+    learns = model.parser.taught and args.taught is None and args.only != "renderer"
     check_lesson(args, learns)
     if args.start is not None:
-        model = go_on_from(model, args.start, args.keep_rest)
+        model = go_on_from(model, args.start, args.only)
     if args.taught is not None:
         keep_taught(model, args.taught)
     model.to(accelerator.device)
@@ -162,7 +163,7 @@ def train(args: ParserTraining) -> ParserMetrics | None:
                     generator=generators,
                     features_BTLF=None if features_BTLF is None else features_BTLF[part],
                     lesson=None if lesson is None else (lesson[0][part], lesson[1][part]),
-                    redraw=step >= args.first_redraw and not args.keep_rest,
+                    redraw=step >= args.first_redraw and args.only != "sight",
                 )
                 run.backward(loss.total(), vars(loss))
             run.update(step)
@@ -183,12 +184,14 @@ def check_lesson(args: ParserTraining, learns: bool) -> None:
     """Raise a SettingsError where what a parser is to be taught does not go together."""
     if args.first_redraw and not learns:
         raise SettingsError("first_redraw is for parsers that are taught: set parser.kind=votes and leave out taught")
-    if args.keep_rest and (args.start is None or not learns):
-        raise SettingsError("keep_rest is for parsers that are taught: name a checkpoint of one with --start")
+    if args.only == "sight" and (args.start is None or not learns):
+        raise SettingsError("only sight is for parsers that are taught: name a checkpoint of one with --start")
+    if args.only == "renderer" and (args.start is None or args.taught is not None):
+        raise SettingsError("only renderer goes on from a whole checkpoint: name it with --start, and leave out taught")
 
 
-def go_on_from(model: TextOCVP, checkpoint: Path, whole: bool) -> TextOCVP:
-    """The model with parser and renderer of a checkpoint, or that checkpoint as a whole.
+def go_on_from(model: TextOCVP, checkpoint: Path, only: Literal["all", "sight", "renderer"]) -> TextOCVP:
+    """The model with parser and renderer of a checkpoint, or that checkpoint as a whole, of which only a part learns.
 
     Raises:
         SettingsError: if the checkpoint was built otherwise.
@@ -200,7 +203,10 @@ def go_on_from(model: TextOCVP, checkpoint: Path, whole: bool) -> TextOCVP:
         parser = replace(parser, encoder_fingerprint=encoder.fingerprint)  # type: ignore[call-arg]
     if (source.config.parser, source.config.renderer) != (parser, model.config.renderer):
         raise SettingsError(f"{checkpoint} is built otherwise: give the same preset and set as it was trained with")
-    if whole:
+    if only == "renderer":
+        source.requires_grad_(False)
+        source.renderer.requires_grad_(True)
+    if only != "all":
         return source
     model.parser.load_state_dict(source.parser.state_dict())
     model.renderer.load_state_dict(source.renderer.state_dict())

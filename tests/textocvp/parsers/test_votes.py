@@ -14,7 +14,8 @@ from textocvp.config import ModelConfig
 from textocvp.parsers.votes import VotesConfig, VotesParser, count_votes, vote_loss, vote_targets
 from textocvp.slots import SlotState
 
-RED, BLUE, TABLE, ARM = (255, 87, 89), (78, 121, 167), (47, 47, 47), (120, 120, 120)
+RED, BLUE, GREEN = (255, 87, 89), (78, 121, 167), (89, 161, 79)
+TABLE, ARM = (47, 47, 47), (120, 120, 120)
 
 
 def perfect(labels_NHW: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,6 +142,29 @@ def test_a_hidden_object_keeps_its_slot_and_what_appears_takes_a_free_one() -> N
     slot = int(winners[0, 5, 5])
     assert torch.equal(state.position[0, 1, slot], state.position[0, 0, slot])
     assert state.presence[0, :, :, 0].sum(1).tolist() == [4, 5, 6]  # the robot comes, then the fourth thing
+
+
+def test_what_comes_late_beside_the_robot_is_its_tool_until_it_is_as_large_as_a_thing() -> None:
+    arm, thing = (1, 0, 10, 14, 4), (2, 24, 24, 5, 5)
+    labels = [
+        scene(arm, thing),
+        scene(arm, thing, (3, 15, 10, 5, 5)),  # the tool, seen from near
+        scene(arm, thing, (3, 15, 10, 7, 8)),
+        scene(arm, thing, (3, 0, 24, 5, 5)),
+    ]
+    winners, state = parse(labels, {2: BLUE, 3: RED})
+    assert [int(winners[t, y, x]) for t, y, x in ((1, 17, 12), (2, 18, 14), (3, 2, 26))] == [1, 3, 3]
+    assert state.presence[0, :, 3, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_what_appears_far_away_is_a_thing_that_was_lost_if_it_looks_like_it() -> None:
+    labels = [
+        scene((2, 2, 2, 5, 5), (3, 20, 20, 5, 5)),
+        scene((3, 20, 20, 5, 5), (4, 24, 2, 5, 5), (5, 2, 25, 5, 5)),
+    ]
+    winners, _ = parse(labels, {2: RED, 3: BLUE, 4: RED, 5: GREEN})
+    assert winners[1, 26, 4] == winners[0, 4, 4]
+    assert winners[1, 4, 27] == 4  # this one looks like nothing that was
 
 
 def test_sizes_that_cannot_be_are_refused() -> None:

@@ -146,7 +146,8 @@ def test_a_renderer_waits_only_for_a_parser_that_is_taught(folder: Path) -> None
     before = weights(done.out)
     for changes, said in (
         ({"first_redraw": 2}, "first_redraw is for parsers that are taught"),
-        ({"keep_rest": True}, "keep_rest is for parsers that are taught"),
+        ({"only": "sight"}, "only sight is for parsers that are taught"),
+        ({"only": "renderer"}, "only renderer goes on from a whole checkpoint"),
         ({"clip": 50}, "need episodes of"),
         ({"cache_features": True}, "needs a frozen image encoder"),
     ):
@@ -190,23 +191,27 @@ def test_a_taught_parser_is_taken_as_it_is(folder: Path, monkeypatch: pytest.Mon
         train(replace(taken, out=folder / "wide", set=("parser.channels=8",)))
 
 
-def test_a_whole_model_that_learns_to_see_better_keeps_all_else(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_alone_goes_on_learning_leaves_all_else_of_a_whole_model(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(PRESETS, VOTES.name, VOTES)
     whole = folder / "whole"
     build(VOTES).save_pretrained(whole)
     settings = dict(preset=VOTES.name, steps=2, batch=3, clip=1, start=whole)
-    better, redrawn = (parser_run(folder, f"kept: {keep}", keep_rest=keep, **settings) for keep in (True, False))
-    for run in (better, redrawn):
+    runs = {only: parser_run(folder, f"only {only}", only=only, **settings) for only in ("all", "sight", "renderer")}
+    for run in runs.values():
         train(run)
-    train(replace(better, steps=3))
-    with pytest.raises(SettingsError, match="holds a run with keep-rest True, not False"):
-        train(replace(better, keep_rest=False, steps=4))
-    before, after = load_file(whole / "model.safetensors"), weights(better.out)
-    assert before.keys() == after.keys()
-    changed = [name for name in before if not torch.equal(before[name], after[name])]
-    assert changed and all(name.startswith("parser.network.") for name in changed)
-    stages = [read_config(run.out / "checkpoint").stage for run in (better, redrawn)]
-    assert stages == ["predictor", "parser"]  # what slots hold has changed, which its predictor does not know
+    train(replace(runs["sight"], steps=3))
+    with pytest.raises(SettingsError, match="holds a run with only 'sight', not 'all'"):
+        train(replace(runs["sight"], only="all", steps=4))
+    before = load_file(whole / "model.safetensors")
+    for only, prefix in (("sight", "parser.network."), ("renderer", "renderer.")):
+        after = weights(runs[only].out)
+        assert before.keys() == after.keys()
+        changed = [name for name in before if not torch.equal(before[name], after[name])]
+        assert changed and all(name.startswith(prefix) for name in changed)
+    stages = [read_config(run.out / "checkpoint").stage for run in runs.values()]
+    assert stages == ["parser", "predictor", "predictor"]  # where slots hold other things no predictor knows them
 
 
 def test_on_a_floor_in_uneven_light_shadows_are_floor_and_gray_things_are_not() -> None:
