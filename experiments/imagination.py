@@ -3,7 +3,7 @@
     python experiments/imagination.py              # default: about 25 minutes on 2 cores
     python experiments/imagination.py --quick      # a first look
     python experiments/imagination.py --retrained runs/outcome-1/checkpoint --retrained runs/outcome-2/checkpoint
-    python experiments/imagination.py --scene cliport --checkpoint runs/cliport/checkpoint
+    python experiments/imagination.py --scene cliport --scenes 12   # on CLIPort's table, 12 scenes of each family
 
 Goals in `RearrangeBlocks-v0`: blocks in bowls that are taken, blocks that carry another, blocks that are to change
 places, towers, and pictures of other arrangements. Ours searches sequences of sentences, and asks the world model where
@@ -14,6 +14,8 @@ the same scenes. `--scene cliport` asks all this on CLIPort's table, seen by its
 outcome in one step then foresees by whole films. Writes `results.json`, `timings.json`, `report.html`, plots and clips
 into `--out`.
 """
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +56,7 @@ from experiments.study.foresight import (
 )
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import to_uint8
-from experiments.study.run import Found, Part, Run, Study, StudyArgs, UsageError, start
+from experiments.study.run import Found, Part, Run, ScenesArgs, Study, StudyArgs, UsageError, start
 from experiments.study.scenes import SCENES_PER_SEED, StudyScene
 from planning import (
     AnyGoal,
@@ -85,7 +87,7 @@ SEEDS = "ours, over training seeds"
 
 
 @dataclass
-class Args(StudyArgs):
+class Args(ScenesArgs):
     """Arguments of this study."""
 
     scene: Literal["simple", "cliport"] = "simple"
@@ -119,8 +121,11 @@ class Sizes:
     outcomes: int  # scenes in which sentences are foreseen
     clips: int  # episodes that are shown
 
-
-QUICK, DEFAULT = Sizes(4, 12, 4), Sizes(60, 100, 12)
+    @classmethod
+    def of(cls, args: Args) -> Sizes:
+        """How much a command line asks for: `--scenes` of each family, and as many again to foresee sentences in."""
+        base = cls(4, 12, 4) if args.quick else cls(60, 100, 12)
+        return replace(base, scenes=args.scenes, outcomes=args.scenes) if args.scenes else base
 
 
 # --- units of work ----------------------------------------------------------------------------------------------------
@@ -411,7 +416,7 @@ STUDY = Study(
     again="The same seed gives the same figures, but for the milliseconds.",
     title="Imagination",
     question="Does it help to foresee what a sentence leads to, where that is not what the sentence says?",
-    sizes=lambda args: QUICK if args.quick else DEFAULT,
+    sizes=Sizes.of,
     units=units,
     cases=cases,
     rows=rows,

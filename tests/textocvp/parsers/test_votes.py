@@ -158,10 +158,7 @@ def test_what_comes_late_beside_the_robot_is_its_tool_until_it_is_as_large_as_a_
 
 
 def test_what_appears_far_away_is_a_thing_that_was_lost_if_it_looks_like_it() -> None:
-    labels = [
-        scene((2, 2, 2, 5, 5), (3, 20, 20, 5, 5)),
-        scene((3, 20, 20, 5, 5), (4, 24, 2, 5, 5), (5, 2, 25, 5, 5)),
-    ]
+    labels = [scene((2, 2, 2, 5, 5), (3, 20, 20, 5, 5)), scene((3, 20, 20, 5, 5), (4, 24, 2, 5, 5), (5, 2, 25, 5, 5))]
     winners, _ = parse(labels, {2: RED, 3: BLUE, 4: RED, 5: GREEN})
     assert winners[1, 26, 4] == winners[0, 4, 4]
     assert winners[1, 4, 27] == 4  # this one looks like nothing that was
