@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from envs import dataset
-from envs.collect import Args
+from envs.collect import Args, main
 from envs.colors import SEEN
 from envs.dataset import EpisodeConfig, collect, record_episode
 from envs.splits import SPLITS
@@ -444,3 +444,12 @@ def test_a_piece_that_lacks_a_column_is_collected_again(tmp_path: Path) -> None:
     with h5py.File(whole) as one, h5py.File(path) as two:
         assert np.array_equal(one["episode/options"][:], two["episode/options"][:])
         assert np.array_equal(one["frames"][:], two["frames"][:])
+
+
+@pytest.mark.parametrize(("scene", "told"), [("simple", False), ("cliport", True)])
+def test_an_arm_of_another_shape_is_told_at_the_end(
+    scene: str, told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("envs.collect.find_package", lambda: None)
+    main(Args(split="val", episodes=1, scene=scene, image_size=32, out=tmp_path / "a.h5"))
+    assert ("arm is of cylinders" in capsys.readouterr().out) == told
