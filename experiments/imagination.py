@@ -3,7 +3,7 @@
     python experiments/imagination.py              # default: about 25 minutes on 2 cores
     python experiments/imagination.py --quick      # a first look
     python experiments/imagination.py --retrained runs/outcome-1/checkpoint --retrained runs/outcome-2/checkpoint
-    python experiments/imagination.py --scene cliport --scenes 12   # on CLIPort's table, 12 scenes of each family
+    python experiments/imagination.py --scene cliport --scenes 10   # on CLIPort's table, 10 scenes of each family
 
 Goals in `RearrangeBlocks-v0`: blocks in bowls that are taken, blocks that carry another, blocks that are to change
 places, towers, and pictures of other arrangements. Ours searches sequences of sentences, and asks the world model where

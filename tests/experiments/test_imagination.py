@@ -3,7 +3,6 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from experiments.imagination import ATTEMPTS, SEEDS, STUDY, Args, Episode, Sizes
 from experiments.study.foresight import CASES, LINES, OURS, ByFilms, Foresight, TrueSlotsPlanner, foresight
 from experiments.study.pool import Worker
 from experiments.study.run import UsageError, run
-from planning import Foresees, Goal, PictureGoal, SegmentationGrounder, Thing, places
+from planning import Goal, PictureGoal, SegmentationGrounder, Thing, places
 from textocvp import WorldModel
 
 
@@ -103,8 +102,8 @@ def test_cliports_table_has_a_folder_and_a_model_of_its_own() -> None:
     assert "--scene cliport" in cliport.command("imagination")
 
 
-def test_episodes_on_cliports_table() -> None:
-    """Rows that imagine nothing do what they do elsewhere; ours looks further."""
+def test_episodes_on_cliports_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that foresees no outcome foresees by films; rows that imagine nothing do what they do elsewhere."""
     worker = Worker(WorldModel.from_pretrained("cliport"))
     played = {}
     for key, family in (
@@ -117,10 +116,12 @@ def test_episodes_on_cliports_table() -> None:
     assert all(1 <= one.steps <= ATTEMPTS[family] for (_, family), one in played.items())
     env = worker.environment(scene, record=False)
     observation, _ = env.reset(seed=scene.seed, options=dict(scene.options))
-    model = ByFilms(cast(Foresees, worker.world_model))  # as one that has learned no outcomes foresees
+    assert foresight(worker.world_model) is worker.world_model
+    monkeypatch.setattr(WorldModel, "foresees", False)
+    model = foresight(worker.world_model)
+    assert isinstance(model, ByFilms)
     said = [played["no imagination", "plain"].instructions[0]] * 2
     ends = model.outcome(model.parse(observation["rgb"][None]), said)
     film = model.rollout(model.parse(observation["rgb"][None]), said[:1], horizon=model.longest_horizon)
     np.testing.assert_allclose(ends.positions[1, 1], film.positions[0, -1], atol=1e-3)
     assert ends.slots.shape[1] == 2
-    assert foresight(worker.world_model) is worker.world_model

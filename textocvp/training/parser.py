@@ -31,6 +31,8 @@ from textocvp.training.losses import ParserLoss, image_loss, mask_loss, place_lo
 from textocvp.training.run import Run, SettingsError, allowed_settings, close_run, open_data, open_run
 from textocvp.training.teacher import Teacher
 
+Learner = Literal["all", "sight", "renderer"]  # what of a checkpoint goes on learning
+
 
 @dataclass(kw_only=True)
 class ParserTraining(ClipTraining):
@@ -52,7 +54,7 @@ class ParserTraining(ClipTraining):
 
     start: Path | None = None
     """Checkpoint to begin with, whose architecture is kept, instead of random weights: first stills, then clips."""
-    only: Literal["all", "sight", "renderer"] = "all"
+    only: Learner = "all"
     """What of `start` goes on learning: `sight`, the network of a parser that is taught, or the `renderer`; all else
     stays as it is, a predictor, too. With `all` parser and renderer begin with its weights, and there is no
     predictor."""
@@ -190,7 +192,7 @@ def check_lesson(args: ParserTraining, learns: bool) -> None:
         raise SettingsError("only renderer goes on from a whole checkpoint: name it with --start, and leave out taught")
 
 
-def go_on_from(model: TextOCVP, checkpoint: Path, only: Literal["all", "sight", "renderer"]) -> TextOCVP:
+def go_on_from(model: TextOCVP, checkpoint: Path, only: Learner) -> TextOCVP:
     """The model with parser and renderer of a checkpoint, or that checkpoint as a whole, of which only a part learns.
 
     Raises:
