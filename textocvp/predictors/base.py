@@ -5,7 +5,8 @@ A predictor has one of two forms (`PredictorConfig.attention`):
 - `window`, as published (TextOCVP, TMLR 2026, section 3.2). The last frames attend to each other in both directions,
   a code tells the age of each, and every step computes the whole window again.
 - `causal`, ours. A frame attends to itself and to earlier frames, and a code tells its number. So one pass trains all
-  frames of an episode, and a rollout keeps keys and values and computes only the newest frame.
+  frames of an episode, and a rollout keeps keys and values and computes only the newest frame. With `direct` it reads
+  the last given frame again instead of the imagined ones.
 
 With `layout.explicit` the network changes a slot's content, position and scale; unused slots and the background stay as
 they are. Unused slots are masked. Slots are a set: their order changes only the order of the prediction.
@@ -44,10 +45,17 @@ class PredictorConfig:
     window: int = 10  # the longest past in frames; for `causal` also the longest rollout
     age_encoding: Literal["learned", "sinusoidal"] = "learned"  # of time codes, one per frame for all its slots
     residual: bool = True  # predict the change of the slots instead of the slots
+    # Read the given frames for every new frame, not what was imagined between: direct instead of iterated forecasting,
+    # so that errors do not add up. For `causal`.
+    direct: bool = False
     feed_forwards: Literal[1, 2] = 2  # nets in a layer: 2 as in the authors' code, 1 as in the paper's text
     # Read and change content in units of its deviation over the training slots. The published model does not; explicit
     # slots always do.
     standardize: bool = False
+
+    def __post_init__(self) -> None:
+        if self.direct and not self.causal:
+            raise ValueError("predictor.direct needs predictor.attention=causal")
 
     @property
     def causal(self) -> bool:
@@ -193,15 +201,16 @@ class SlotPredictor(nn.Module):
         seed_BTkD = seed_BTKD[:, :, used_k]
         acting_Bk = None if acting_BK is None else acting_BK[:, used_k]
         state = self._start(seed_BTkD, text, longest if use_cache and self.config.causal else 0, acting_Bk)
-        frames = list(seed_BTkD.unbind(1))  # (B, k, D) each; first the T of the seed, in the end T + S
-        maps = []
+        read = list(seed_BTkD.unbind(1))  # (B, k, D) each; first the T of the seed, in the end T + S
+        imagined, maps = [], []
         for _ in range(steps):
-            past_BTkD = torch.stack(frames[state.cached :][-self.config.window :], dim=1)
+            past_BTkD = torch.stack(read[state.cached :][-self.config.window :], dim=1)
             next_B1kD, map_BnhkL = self._predict(past_BTkD, state, newest_only=True)
-            frames.append(next_B1kD[:, 0])
+            imagined.append(next_B1kD[:, 0])
+            read.append(read[-1] if self.config.direct else imagined[-1])
             maps.append(map_BnhkL)
 
-        slots_BSkD = torch.stack(frames[-steps:], dim=1).to(seed_BTKD.dtype)
+        slots_BSkD = torch.stack(imagined, dim=1).to(seed_BTKD.dtype)
         slots_BSKD = seed_BTKD[:, -1:].repeat(1, steps, 1, 1).index_copy(2, used_k, slots_BSkD)
         if not return_attention:
             return Imagined(slots_BSKD)

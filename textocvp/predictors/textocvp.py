@@ -32,6 +32,7 @@ class TextOCVPConfig(PredictorConfig):
     appearance: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.color_bias and self.appearance:
             raise ValueError("predictor.appearance and predictor.color_bias exclude each other: set one to false")
 

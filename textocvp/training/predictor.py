@@ -28,7 +28,7 @@ from textocvp.data.slot_batches import SlotBatches, true_frames
 from textocvp.layers import sinusoids
 from textocvp.model import TextOCVP, check_parts
 from textocvp.predictors import build_predictor
-from textocvp.predictors.base import SlotPredictor
+from textocvp.predictors.base import PredictorConfig, SlotPredictor
 from textocvp.presets import preset
 from textocvp.text.base import WordBatch
 from textocvp.text.words import WordsConfig
@@ -54,7 +54,8 @@ class PredictorTraining(TrainingSettings):
     """Checkpoint with the trained parser and renderer: a bundled name, a folder, or a hub id owner/name."""
     finetune: bool = False
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
-    `--set predictor.window=40` they learn longer rollouts. If the checkpoint foresees outcomes, its text encoder stays
+    `--set predictor.window=40` they learn longer rollouts, with `--set predictor.direct=true` to imagine every frame
+    from the first. If the checkpoint foresees outcomes, its text encoder stays
     as it is, for these need it."""
     outcome: bool = False
     """Train the predictor of whole sentences, beside the one that the checkpoint `parser` has."""
@@ -119,7 +120,9 @@ class PredictorStage(nn.Module):
             return given_BTKD[:, :0], words_loss
         if not self.predictor.config.causal:
             return self.predictor.rollout(given_BTKD, text, imagined + 1, acting_BK=told).slots_BSKD, words_loss
-        if imagined:
+        if imagined and self.predictor.config.direct:
+            given_BTKD = torch.cat([given_BTKD, given_BTKD[:, -1:].expand(-1, imagined, -1, -1)], dim=1)
+        elif imagined:
             with torch.no_grad():
                 imagined_BSKD = self.predictor.rollout(given_BTKD, text, imagined, acting_BK=told).slots_BSKD
             # Under autocast some versions of torch would reuse weights that were cast without a gradient.
@@ -129,14 +132,17 @@ class PredictorStage(nn.Module):
 
 
 def schedule(
-    args: PredictorTraining, causal: bool, step: int, frames: int, rng: np.random.Generator
+    args: PredictorTraining, form: PredictorConfig, step: int, frames: int, rng: np.random.Generator
 ) -> tuple[int, int]:
     """How many true frames update number `step` gives, from the first on, and how many the model then imagines itself.
 
     Args:
-        causal: the predictor's form, else `window`.
+        form: of the predictor. What is `direct` imagines all of an episode from its first frame.
         frames: of an episode.
     """
+    if form.direct:
+        return 1, frames - 2
+    causal = form.causal
     begin = round(args.steps * (1 - args.autoregressive)) if causal else 0
     if step < begin:
         return frames - 1, 0
@@ -196,8 +202,10 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
             # Every process draws the whole batch, and then computes its rows of it.
             rng = step_rng(args.seed, step)
             batch = batches.draw(rng, args.batch)
-            given, imagined = schedule(args, causal, step, frames, rng)
-            given_BTKD = batches.noisy(rng, batch.slots_BTKD[:, :given])
+            given, imagined = schedule(args, predictor.config, step, frames, rng)
+            given_BTKD = batch.slots_BTKD[:, :given]
+            if not predictor.config.direct:  # which never reads what it got a little wrong
+                given_BTKD = batches.noisy(rng, given_BTKD)
             rng.random(args.batch)  # unused; without it a seed would give other runs than it always did
             # The causal form predicts from every frame the next, the window form only new frames.
             first, last = 1 if causal else given, given + imagined  # numbers of the frames that are predicted
@@ -262,7 +270,7 @@ def assemble(
             raise SettingsError(f"{args.parser} has no trained predictor to finetune: leave out finetune")
         model = trained
         with allowed_settings():
-            extend_window(model, args.set)
+            extend(model, args.set)
         meet(model, captions)
         if model.outcome is None:
             model.text.train()
@@ -322,16 +330,19 @@ def with_outcome(args: PredictorTraining, trained: TextOCVP) -> TextOCVP:
     return trained
 
 
-def extend_window(model: TextOCVP, settings: Iterable[str]) -> None:
-    """Let the predictor take more frames, as `predictor.window=FRAMES` says; within the old window it stays as it is.
+def extend(model: TextOCVP, settings: Iterable[str]) -> None:
+    """Let the predictor take more frames, as `predictor.window=FRAMES` says, or read others (`predictor.direct`).
+
+    Within the old window it has the weights that it had.
 
     Raises:
         ValueError: if a setting is another one, makes no sense, or would shorten the window.
     """
     for setting in (settings := tuple(settings)):
-        if not setting.startswith("predictor.window="):
+        if not setting.startswith(("predictor.window=", "predictor.direct=")):
             raise ValueError(
-                f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow"
+                f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow and "
+                "predictor.direct change"
             )
     config, predictor = with_settings(model.config, settings), model.predictor
     old, new = model.config.predictor, config.predictor
