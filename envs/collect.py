@@ -28,7 +28,6 @@ from .dataset import Backend, EpisodeConfig, World, collect, episode_count
 from .factors import FACTORS
 from .geometry import SIZES
 from .physics.camera import PRESETS
-from .physics.ur5 import find_package, missing
 from .scenes import SCENES
 from .splits import SEEDS_PER_SPLIT, SPLITS
 
@@ -118,8 +117,8 @@ def main(args: Args) -> None:
         out = args.out or Path(f"data/{name}-{args.split}.h5")
         collect(config, args.episodes, out, args.workers, args.backend, fresh=args.fresh)
         print(f"{out}: {episode_count(out, config)} episodes of split {args.split}")
-        if args.world == "tabletop" and SCENES[args.scene].arm.paint is not None and find_package() is None:
-            print(missing())  # the environment has warned before, where a bar may have hidden it
+        if args.world == "tabletop" and (missing := SCENES[args.scene].missing):
+            print(missing)  # the environment has warned before, where a bar may have hidden it
 
 
 def configuration(args: Args) -> World:

@@ -15,6 +15,7 @@ from .factors import NO_FACTORS, SHARES, Factors
 from .geometry import SIZES, SPAWN, TABLE, WORKSPACE, Box2, Point, Sizes
 from .physics.arm import A2, A3, D1, D4, D5, D6, Arm, Paint
 from .physics.camera import PRESETS, CameraPreset
+from .physics.ur5 import find_package, missing
 from .scene import MAX_OBJECTS
 
 
@@ -67,6 +68,11 @@ class Setup:
     def palette(self) -> dict[str, Any]:
         """See `envs.colors.palette`; the robot's colour is that of most of it."""
         return palette(self.arm.paint.dark if self.arm.paint else ROBOT_RGB, self.table_rgb)
+
+    @property
+    def missing(self) -> str:
+        """What to say where the arm should have the UR5's shape and its package is not installed; else nothing."""
+        return missing() if self.arm.paint is not None and find_package() is None else ""
 
     def object_rgb(self, index: int, color: str) -> RGB:
         """The exact colour of an object."""

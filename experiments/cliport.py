@@ -22,6 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from envs.scenes import SCENES
 from envs.tasks.base import CLIPORT_RADIUS
 from experiments.report.page import CardSpec, Clips, Section
 from experiments.report.results import Results
@@ -153,6 +154,7 @@ def prepare(run: Run) -> tuple[Sequence[Source], Sequence[str]]:
     """The episodes, and a line for each that is left out; a UsageError if none can be measured."""
     path = cast(Args, run.args).episodes
     if path is None:
+        run.remarks += [f"Careful: {missing}."] if (missing := SCENES["cliport"].missing) else []
         return own_scenes(run, run.sizes.scenes, SIDE), ()
     try:
         with warnings.catch_warnings():

@@ -31,6 +31,7 @@ import numpy as np
 import tyro
 
 from envs import Expert
+from envs.scenes import SCENES
 from envs.splits import SPLITS
 from envs.tabletop import TabletopEnv
 from envs.tasks.rearrange import FAMILIES
@@ -311,6 +312,7 @@ def milliseconds(run: Run) -> list[float]:
         if look == "simple":
             raise UsageError(f"{problem}, which this study is about")
         run.remarks.append(f"{problem}: it foresees by whole films.")
+    run.remarks += [f"Careful: {missing}."] if (missing := SCENES[look].missing) else []
     run.remarks.append(f"Scenes {look}, {side}x{side} pixels.")
     scene = family_scene("plain", FIRST, look, side)
     env = scene.make(record=False)

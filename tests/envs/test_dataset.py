@@ -450,6 +450,6 @@ def test_a_piece_that_lacks_a_column_is_collected_again(tmp_path: Path) -> None:
 def test_an_arm_of_another_shape_is_told_at_the_end(
     scene: str, told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("envs.collect.find_package", lambda: None)
+    monkeypatch.setattr("envs.scenes.find_package", lambda: None)
     main(Args(split="val", episodes=1, scene=scene, image_size=32, out=tmp_path / "a.h5"))
     assert ("arm is drawn with cylinders" in capsys.readouterr().out) == told

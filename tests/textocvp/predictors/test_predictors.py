@@ -131,6 +131,19 @@ def test_cached_and_uncached_rollouts_agree(kind, layout, seed_frames):
 
 
 @every_kind
+@pytest.mark.parametrize("use_cache", [True, False])
+def test_a_direct_rollout_reads_the_last_given_frame_for_every_new_one(kind, use_cache):
+    model, slots = build(kind=kind, direct=True), scene(frames=2)
+    with torch.no_grad():
+        rolled = model.rollout(slots, text(), 4, use_cache=use_cache).slots_BSKD
+        forced = model(torch.cat([slots, slots[:, -1:].expand(-1, 3, -1, -1)], 1), text())[:, 1:]
+        iterated = build(kind=kind).rollout(slots, text(), 4).slots_BSKD
+    torch.testing.assert_close(rolled, forced, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(rolled[:, 0], iterated[:, 0], atol=1e-5, rtol=1e-4)
+    assert (rolled[:, 2] - iterated[:, 2]).abs().max() > 0.01
+
+
+@every_kind
 @both_forms
 def test_one_step_of_a_rollout_is_the_teacher_forced_prediction(kind, attention):
     model, slots = build(attention, kind=kind), scene(frames=4)

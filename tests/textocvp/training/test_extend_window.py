@@ -13,7 +13,7 @@ from tests.textocvp.conftest import PLACED, PUBLISHED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel
 from textocvp.config import ModelConfig, with_settings
-from textocvp.training.predictor import PredictorTraining, extend_window, train
+from textocvp.training.predictor import PredictorTraining, extend, train
 
 TEXT = "put the red block in the blue bowl"
 
@@ -28,7 +28,7 @@ def test_rollouts_within_the_old_window_stay_as_they_are(kind, encoding, scene: 
     model = build(with_settings(PLACED, [f"predictor.kind={kind}", f"predictor.age_encoding={encoding}"]))
     world_model = WorldModel(model)
     before = world_model.rollout(scene, TEXT, horizon=8)
-    extend_window(model, ["predictor.window=20"])
+    extend(model, ["predictor.window=20"])
     assert torch.equal(world_model.rollout(scene, TEXT, horizon=8).slots, before.slots)
     assert world_model.longest_horizon == 20
     further = world_model.rollout(scene, TEXT, horizon=20)
@@ -41,7 +41,7 @@ def test_rollouts_within_the_old_window_stay_as_they_are(kind, encoding, scene: 
 def test_codes_that_training_never_reached_are_not_copied():
     model = build(PUBLISHED)
     before = model.predictor.ages
-    extend_window(model, ["predictor.window=7"])
+    extend(model, ["predictor.window=7"])
     after = model.predictor.ages
     assert after.shape[0] == 8 and before.shape[0] == 5
     assert torch.equal(after[:4], before[:4])
@@ -51,11 +51,26 @@ def test_codes_that_training_never_reached_are_not_copied():
 def test_other_changes_and_shorter_windows_are_refused():
     model = build(PLACED)
     with pytest.raises(ValueError, match=r"'predictor.layers=4'.*only predictor.window may grow"):
-        extend_window(model, ["predictor.layers=4"])
+        extend(model, ["predictor.layers=4"])
     with pytest.raises(ValueError, match="grow, not shrink: it is 8 frames, 6 were asked for"):
-        extend_window(model, ["predictor.window=6"])
+        extend(model, ["predictor.window=6"])
     with pytest.raises(ValueError, match="type int"):
-        extend_window(model, ["predictor.window=long"])
+        extend(model, ["predictor.window=long"])
+    published = build(PUBLISHED)
+    with pytest.raises(ValueError, match=r"predictor\.direct needs predictor\.attention=causal"):
+        extend(published, ["predictor.direct=true"])
+    assert not published.predictor.config.direct
+
+
+def test_what_imagined_from_frame_to_frame_can_imagine_from_the_first(scene: np.ndarray):
+    model = build(PLACED)
+    world_model = WorldModel(model)
+    before = world_model.rollout(scene, TEXT, horizon=3).slots
+    extend(model, ["predictor.direct=true"])
+    after = world_model.rollout(scene, TEXT, horizon=3).slots
+    assert torch.equal(after[:, 1], before[:, 1])
+    assert (after[:, 2] - before[:, 2]).abs().max() > 1e-3
+    assert model.config.predictor.direct
 
 
 def test_fine_tuning_learns_longer_rollouts(tmp_path: Path, scene: np.ndarray):

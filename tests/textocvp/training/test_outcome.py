@@ -12,6 +12,10 @@ import torch
 from tests.textocvp.conftest import PLACED, build
 from tests.textocvp.toy_episodes import write_toy_episodes
 from textocvp import WorldModel
+from textocvp.data import open_episodes
+from textocvp.model import TextOCVP
+from textocvp.parsers.base import to_frames
+from textocvp.training.evaluate_predictor import HeldOut, Outcomes, measure_outcomes
 from textocvp.training.predictor import PredictorTraining, train
 from textocvp.training.run import SettingsError
 
@@ -45,6 +49,24 @@ def test_films_trained_later_leave_the_outcome_as_it_is(args: PredictorTraining,
     old, new = (WorldModel.from_pretrained(folder) for folder in (ready, args.out.parent / "tuned" / "checkpoint"))
     assert torch.equal(new.outcome(scene, TEXT).slots, old.outcome(scene, TEXT).slots)
     assert not torch.equal(new.rollout(scene, TEXT, horizon=8).slots, old.rollout(scene, TEXT, horizon=8).slots)
+
+
+def test_held_out_episodes_are_judged_at_their_own_end(args: PredictorTraining, monkeypatch: pytest.MonkeyPatch):
+    longer = write_toy_episodes(args.out.parent / "val.h5", [14, 5])
+    seen = []
+
+    def measure(model: TextOCVP, held: HeldOut, *count: int) -> Outcomes:
+        seen.append(held)
+        return measure_outcomes(model, held, *count)
+
+    monkeypatch.setattr("textocvp.training.predictor.measure_outcomes", measure)
+    train(replace(args, val=longer, parse_every=1))
+    with open_episodes(longer) as episodes:
+        model = TextOCVP.from_pretrained(args.parser)
+        for index, held_2KD in enumerate(seen[-1].slots_ETKD):
+            true_TKD = model.parser(to_frames(episodes.frames(index)[None])).slots_BTKD[0]
+            torch.testing.assert_close(held_2KD, true_TKD[[0, -1]], atol=0.01, rtol=0.01)
+            assert (true_TKD[0] - true_TKD[-1]).abs().max() > 0.1
 
 
 def test_frames_are_skipped_for_outcomes_only(args: PredictorTraining):

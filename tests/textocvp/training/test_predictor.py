@@ -19,6 +19,7 @@ from tests.textocvp.training.runs import predictor_run, same_weights, train, tra
 from textocvp.checkpoint import CheckpointError
 from textocvp.config import ModelConfig, PredictorConfig
 from textocvp.model import TextOCVP
+from textocvp.predictors.textocvp import TextOCVPConfig
 from textocvp.training.evaluate_predictor import SlotErrors
 from textocvp.training.predictor import PredictorStage, PredictorTraining, schedule
 from textocvp.training.run import SettingsError
@@ -158,21 +159,25 @@ def test_words_come_from_the_training_file(folder: Path) -> None:
 def test_imagined_part_grows_to_the_whole_episode_and_every_frame_is_trained() -> None:
     args = PredictorTraining(Path(), Path(), Path(), parser=Path(), steps=1000, autoregressive=0.4, horizon=4)
 
-    def schedules(causal: bool) -> list[tuple[int, int]]:
-        return [schedule(args, causal, step, 25, np.random.default_rng(step)) for step in range(1000)]
+    def schedules(attention: str, direct: bool = False) -> list[tuple[int, int]]:
+        form = TextOCVPConfig(attention=attention, direct=direct)
+        return [schedule(args, form, step, 25, np.random.default_rng(step)) for step in range(1000)]
 
-    ours = schedules(causal=True)
+    ours = schedules("causal")
     assert all(each == (24, 0) for each in ours[:600])
     assert max(imagined for _, imagined in ours[600:615]) <= 4
     assert (1, 23) in ours[930:]
     assert all(given + imagined == 24 for given, imagined in ours)
-    published = schedules(causal=False)
+    assert set(schedules("causal", direct=True)) == {(1, 23)}
+    published = schedules("window")
     assert all(given >= 1 and given + imagined <= 24 for given, imagined in published)
     assert {imagined for _, imagined in published[:20]} <= {1, 2, 3, 4}
 
 
-def test_imagined_frames_are_the_rollout_and_each_predicts_the_next() -> None:
-    model = build(replace(PLACED, parser=replace(PLACED.parser, layout=LAYOUT)))
+@pytest.mark.parametrize("direct", [False, True])
+def test_imagined_frames_are_the_rollout_and_each_predicts_the_next(direct: bool) -> None:
+    predictor = replace(PLACED.predictor, direct=direct)
+    model = build(replace(PLACED, parser=replace(PLACED.parser, layout=LAYOUT), predictor=predictor))
     slots_BTKD, words = true_slots(6)[:3], model.text.lookup(["put the red block in the blue bowl"] * 3)
     with torch.device("meta"):  # a default that fails wherever a tensor is made without a device, as on a GPU
         predicted, _ = PredictorStage(model)(slots_BTKD[:, :2], words, 3)
