@@ -11,6 +11,7 @@ giving the same command again; a finished one is left as it is. docs/data.md des
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -161,6 +162,8 @@ def _contact_row(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 if __name__ == "__main__":
     try:
+        if sum(one.split("=")[0] == "--without" for one in sys.argv) > 1:  # only the last would count
+            raise ValueError("give --without once, with all factors after it")
         main(tyro.cli(Args, description=__doc__))
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None

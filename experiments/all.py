@@ -40,7 +40,7 @@ SHOWN = 5  # headline figures a study on the index page
 class Args(StudyArgs):
     """Run every study."""
 
-    only: tuple[str, ...] = ()
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Run only the studies of these names. The page and the summary show what is there of all."""
     fresh: bool = False
     """Run studies again that are done already."""

@@ -279,6 +279,8 @@ def _train(arguments: list[str]) -> int:
         Annotated[train_vqvae.VQVAETraining, tyro.conf.subcommand("vqvae")],
         Annotated[train_mage.MageTraining, tyro.conf.subcommand("mage")],
     ]
+    if sum(one.split("=")[0] == "--set" for one in arguments) > 1:  # only the last would count
+        raise Mistake("give --set once, with all settings after it: --set predictor.layers=2 predictor.window=40")
     chosen: Any = tyro.cli(
         Stage,
         prog="textocvp train",

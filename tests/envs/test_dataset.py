@@ -398,6 +398,9 @@ def test_the_command_line_collects_and_previews(tmp_path: Path) -> None:
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
     out = tmp_path / "test.h5"
+    with pytest.raises(subprocess.CalledProcessError) as twice:
+        run("--scene", "varied", "--without", "tint", "--without", "block", "--out", str(out))
+    assert "error: give --without once" in twice.value.stderr and not out.exists()
     assert "2 episodes of split test" in run("--episodes", "2", "--out", str(out))
     with h5py.File(out) as file:
         assert len(file["episode/seed"]) == 2 and file["frames"].shape[1:] == (32, 32, 3)

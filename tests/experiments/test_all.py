@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import tyro
 
 from experiments.all import NAMES, Args, main, run_program, to_markdown
 from experiments.report.results import Results
@@ -142,6 +143,7 @@ def test_only_some(args: Args) -> None:
     assert ran(args) == (0, ["third"])
     page = (args.folder("") / "index.html").read_text()
     assert page.count("not run") == 2 and "--only" not in page
+    assert tyro.cli(Args, args=["--only", "third", "--only", "first"]).only == ("third", "first")
     args.only = ("forth",)
     with pytest.raises(UsageError, match="unknown study 'forth'; known: first, second, third"):
         ran(args)

@@ -170,6 +170,14 @@ def test_training_says_what_is_missing_before_it_makes_anything(capsys, tmp_path
     assert not out.exists()
 
 
+def test_settings_given_twice_are_not_half_forgotten(capsys, tmp_path) -> None:
+    paths = ["--data", str(tmp_path / "a.h5"), "--val", str(tmp_path / "b.h5"), "--out", str(tmp_path / "run")]
+    both = ["--set", "predictor.layers=2", "--set=predictor.window=30"]
+    said = says(capsys, ["train", "predictor", "--parser", "tabletop-small", *both, *paths], 1)
+    assert "textocvp: give --set once, with all settings after it" in said
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_parser_of_stage_two_is_found_by_its_bundled_name(capsys, tmp_path) -> None:
     write_toy_episodes(tmp_path / "toy.h5", [4, 4])
     data = str(tmp_path / "toy.h5")
