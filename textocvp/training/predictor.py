@@ -5,8 +5,9 @@
 
 Every episode is parsed once. The `causal` form then learns from all frames of an episode in one pass. First it is
 teacher forced. Later it imagines a growing part of the episode, and predicts the true next frames from its own
-imagined ones (dataset aggregation, Ross et al. 2011). The published `window` form sees both ways, so it cannot be
-teacher forced in one pass: it learns from rollouts, and the gradient flows back through them.
+imagined ones (dataset aggregation, Ross et al. 2011). With `predictor.direct` it imagines all frames from the first, in
+training as in use. The published `window` form sees both ways, so it cannot be teacher forced in one pass: it learns
+from rollouts, and the gradient flows back through them.
 
 With `--outcome` a second predictor learns, from the first slots of an episode, its last ones at once; the text encoder
 and the first predictor stay as they are. So a planner can ask where a sentence leads without imagining the way.
@@ -55,8 +56,7 @@ class PredictorTraining(TrainingSettings):
     finetune: bool = False
     """Start from the text encoder and the predictor of the checkpoint `parser`, not from new ones. With
     `--set predictor.window=40` they learn longer rollouts, with `--set predictor.direct=true` to imagine every frame
-    from the first. If the checkpoint foresees outcomes, its text encoder stays
-    as it is, for these need it."""
+    from the first. If the checkpoint foresees outcomes, its text encoder stays as it is, for these need it."""
     outcome: bool = False
     """Train the predictor of whole sentences, beside the one that the checkpoint `parser` has."""
     parse_every: int = 1
@@ -71,7 +71,7 @@ class PredictorTraining(TrainingSettings):
     evaluate_every: int = 250
     evaluate_episodes: int = 200
     autoregressive: float = 0.4
-    """Share of the updates, the last ones, that learn from imagined frames (`window`: all do)."""
+    """Share of the updates, the last ones, that learn from imagined frames (`window`: all do; `direct`: none)."""
     horizon: int = 4
     """Frames of the first rollouts; grows linearly to the whole episode at four fifths of these updates."""
     moving: float = 20.0
