@@ -1,5 +1,6 @@
 """Work units on several processes, with results in order."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -70,4 +71,7 @@ def _worker(load: LoadModel) -> Worker:
 
 
 def _run(load: LoadModel, unit: Unit[Out]) -> Out:
-    return unit.run(_worker(load))
+    with warnings.catch_warnings():
+        # What a user must hear about one sentence or picture, a study says in its figures, about hundreds.
+        warnings.simplefilter("ignore", UserWarning)
+        return unit.run(_worker(load))

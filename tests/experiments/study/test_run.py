@@ -5,7 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from experiments.report.results import Results
 from experiments.study import run as running
 from experiments.study.kept import KeptWork, bare_code
 from experiments.study.methods import BASELINES, METHODS
+from experiments.study.pool import Pool, Worker
 from experiments.study.run import FullArgs, Run, ScenesArgs, StudyArgs, UsageError, run, start
 from tests.experiments.study.tiny import LoadNothing, study
 
@@ -211,3 +213,17 @@ def test_several_models_are_given_as_the_command_says() -> None:
     args = tyro.cli(StudyArgs, args=["--model", "MAGE=runs/mage", "--model", "OCVP-Seq=runs/seq"])
     assert args.model == ("MAGE=runs/mage", "OCVP-Seq=runs/seq")
     assert args.options() == ["--model MAGE=runs/mage", "--model OCVP-Seq=runs/seq", "--seed 0"]
+
+
+@dataclass(frozen=True)
+class Warns:
+    """A unit that says something to a user who is not there."""
+
+    def run(self, worker: Worker) -> int:
+        warnings.warn("nothing seen is 'cyan'", UserWarning, stacklevel=1)
+        return 1
+
+
+def test_what_a_model_says_of_one_sentence_is_not_printed_for_hundreds(recwarn: pytest.WarningsRecorder) -> None:
+    assert list(Pool(LoadNothing(), 1).run([Warns()] * 2)) == [1, 1]
+    assert not [one for one in recwarn if "cyan" in str(one.message)]
