@@ -47,7 +47,7 @@ def test_the_files_hold_no_pickle(folder: Path) -> None:
 
 SHA256 = {
     "cater": "959e9417a1e0dbd983e6ddc4648f320a6183cb2258a13db8e1fdefd2cbdbd4c2",
-    "cliport": "009274116c275aa3ae5a65bbdd1a3b118e95cf4533742a18b4ebc7c0c99c17b4",
+    "cliport": "5616fa1e82d81cf59ce28d11e725d11b7bf573f7d1338c287cdd425e26896bf7",
     "mage-small": "aa57385cef278bc051bc5c3e0479486c2c8a275d557bf476d57cc3a6c6a9c6dd",
     "non-oc-small": "4e1d6426c7f11faff46fa73a73627c6b60b60b458ebd1db6148a0db75fbf2d6d",
     "ocvp-seq-small": "72eb0b316789da74aedbbda90da195278c29b5e43457f3d7c59aecf8d28bcab8",
