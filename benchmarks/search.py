@@ -62,7 +62,7 @@ def main(args: Args) -> None:
         sampled = sample_scene(env, scene)
         image, ground = sampled.observation["rgb"], AppearanceGrounder.from_info(sampled.info)
         goal = Goal.parse(sampled.texts[0])
-        chosen = BeamPlanner(model, depth=1, candidates="scene").plan(image, goal, ground).instruction
+        chosen = BeamPlanner(model, depth=1, candidates="scene", horizon=24).plan(image, goal, ground).instruction
         same += SearchPlanner(model, depth=1).plan(image, goal, ground).instruction == chosen
         if number < args.repeats:
             works = {"films": planning_work(model, "query", sampled), "outcomes": foresight(model, sampled)}

@@ -97,6 +97,8 @@ class Args:
             check_range("--sentences-per-scene", self.sentences_per_scene, 1, None, whole=True)
             if self.policy == "expert":
                 raise ValueError("--sentences-per-scene needs --policy any-sentence; the expert plays one")
+        if self.without and SCENES[self.scene].factors.without(self.without) == SCENES[self.scene].factors:
+            raise ValueError(f"--without leaves out nothing of --scene {self.scene}; --scene varied has these factors")
         other = CATER_ONLY if self.world == "tabletop" else TABLETOP_ONLY
         defaults = {each.name: each.default for each in fields(self)}
         for name in other:

@@ -33,7 +33,7 @@ from experiments.study.cliport import Recorded, Source, misses, other_sentences,
 from experiments.study.clips import extreme_clips
 from experiments.study.closed_loop import LoopEpisode
 from experiments.study.frame_metrics import METRICS, Measures, Scorer, available_measures
-from experiments.study.methods import HORIZON, METHODS, Method, Model, lines, with_paper
+from experiments.study.methods import METHODS, Method, Model, lines, with_paper
 from experiments.study.pool import Unit, Worker
 from experiments.study.predictions import to_tensor
 from experiments.study.run import Found, Part, Run, ScenesArgs, Study, UsageError, start
@@ -55,16 +55,12 @@ BUNDLED = (TAUGHT, LITE0, LITE0_PARSER)  # models whose bundled checkpoints know
 
 
 def _whole_films(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
-    """These episodes are twice as long as those of the easy scene."""
-    return BeamPlanner(model, horizon=_longest(model), seed=seed)
+    """As far as the model looks ahead: these episodes are twice as long as those of the easy scene."""
+    return BeamPlanner(model, seed=seed)
 
 
 def _random(model: Imagines, goal: Goal, rng: np.random.Generator, seed: int) -> Planner:
-    return RandomPlanner(model, rng, depth=1, horizon=_longest(model), seed=seed)
-
-
-def _longest(model: Imagines) -> int:
-    return getattr(model, "longest_horizon", None) or HORIZON
+    return RandomPlanner(model, rng, depth=1, seed=seed)
 
 
 PLAYERS: dict[str, Method] = {

@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from textocvp.rollout import Rollout
 
 
+HORIZON = 24  # frames of a film, where the model sets no limit
+
+
 class Imagines(Protocol):
     """All that a planner knows of a world model."""
 
     def parse(self, video: NDArray[np.uint8], *, seed: int = 0) -> Rollout:
         """The slots of a true video (T, H, W, 3), without imagination."""
 
-    def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int = 24, seed: int = 0) -> Rollout:
+    def rollout(self, obs: Rollout, text: Sequence[str], *, horizon: int, seed: int = 0) -> Rollout:
         """Imagine one scene (B = 1, its last frame) under n texts, or n scenes under n texts: a batch of n."""
 
 
@@ -104,6 +107,13 @@ class _Branch:
     imagined: tuple[tuple[Rollout, int], ...] = ()  # of each instruction: the batch, and the row in it
 
 
+def frames_ahead(planner: BeamPlanner | RandomPlanner) -> int:
+    """The planner's horizon, or else its model's, or else `HORIZON`."""
+    if planner.horizon is not None:
+        return planner.horizon
+    return getattr(planner.world_model, "longest_horizon", None) or HORIZON
+
+
 @dataclass
 class BeamPlanner(_LooksAtMasks):
     """Beam search over sequences of instructions, which move each thing at most once.
@@ -117,7 +127,7 @@ class BeamPlanner(_LooksAtMasks):
     depth: int | None = None  # instructions in a plan; at most, and by default, as many as do not hold yet
     candidates: Literal["goal", "scene"] = "goal"  # move a thing of the goal, or any thing of the scene
     beam: int = 4  # sequences that are kept after each step; 0 keeps all (exhaustive)
-    horizon: int = 24  # frames to imagine for each step
+    horizon: int | None = None  # frames to imagine for each step; by default as far as the model looks ahead
     stride: int = 3  # of the frames that are decoded and scored; the last ones always are
     seed: int = 0  # of the slot sampling
 
@@ -142,7 +152,7 @@ class BeamPlanner(_LooksAtMasks):
             ]
             rows, texts = [row for row, _ in steps], [one.text for _, one in steps]
             starts = starts.select(rows)
-            rollout = self.world_model.rollout(starts, texts, horizon=self.horizon, seed=self.seed)
+            rollout = self.world_model.rollout(starts, texts, horizon=frames_ahead(self), seed=self.seed)
             length = rollout.slots.shape[1]
             frames = watched_frames(length, THRESHOLDS.settle_frames, self.stride)
             new = [measure_rollout(rollout, grounding, want, frames=frames) for want in wanted]
@@ -185,7 +195,7 @@ class RandomPlanner(_LooksAtMasks):
     rng: np.random.Generator
     depth: int | None = None
     from_goal: bool = False  # take the goal's own instructions: only their order is left to chance
-    horizon: int = 24
+    horizon: int | None = None
     seed: int = 0
 
     def plan(self, rgb: NDArray[np.uint8], goal: Goal, grounder: Grounder) -> Plan:
@@ -195,7 +205,7 @@ class RandomPlanner(_LooksAtMasks):
         sequences = self._draw(parsed, grounding, goal)
         rollouts, start = [], parsed
         for one in sequences[0]:
-            rollouts.append(self.world_model.rollout(start, [one.text], horizon=self.horizon, seed=self.seed))
+            rollouts.append(self.world_model.rollout(start, [one.text], horizon=frames_ahead(self), seed=self.seed))
             start = rollouts[-1].last
         ranking = tuple(Candidate(sequence, 0.0, False) for sequence in sequences)
         return Plan(ranking, tuple(rollouts), grounding, perf_counter() - began)

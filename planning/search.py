@@ -20,7 +20,7 @@ from torch import Tensor
 from .camera import View
 from .grounding import Grounder, Grounding, GroundingError
 from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
-from .planners import Candidate, Imagines, Plan, observe
+from .planners import HORIZON, Candidate, Imagines, Plan, observe
 from .relations import CLOSE_VIEW, RELATIONS
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ SAME_PLACE_PX = 4.0
 # Imagined states in which nothing is farther apart than this, in pixels of a `View`, are one state.
 MERGED_PX = 2.0
 SHOWN = 100  # candidates that a plan keeps
-HORIZON = 24  # frames of a film, where the model sets no limit
 
 
 class Foresees(Imagines, Protocol):

@@ -74,8 +74,8 @@ class RolloutCommand:
     """Where to; the ending decides: .gif and .mp4 play, .png is a strip from left to right."""
     checkpoint: str = DEFAULT_CHECKPOINT
     """A bundled name, a folder with config.json and model.safetensors, or a Hugging Face hub id owner/name."""
-    horizon: int = 24
-    """How many frames to imagine."""
+    horizon: int | None = None
+    """How many frames to imagine; by default as far as the model looks ahead."""
     seed: int = 0
     """Of the initial slots, for models that draw them at random."""
     resize: bool = False

@@ -162,7 +162,8 @@ def _checked(value: Any, hint: Any, path: str) -> Any:
     if hint is float and type(value) is int:
         return float(value)
     if type(value) is not hint:
-        raise ValueError(f"{path} is {value!r}: must be of type {hint.__name__}")
+        kind = "true or false" if hint is bool else f"of type {hint.__name__}"
+        raise ValueError(f"{path} is {value!r}: must be {kind}")
     if hint is int and not 1 <= value <= MOST:
         raise ValueError(f"{path} is {value}: must be 1 to {MOST}")
     if hint is float and math.isnan(value):

@@ -87,7 +87,7 @@ class WorldModel:
         obs: Mapping[str, Any] | np.ndarray | Rollout,
         text: str | Sequence[str],
         *,
-        horizon: int = 24,
+        horizon: int | None = None,
         seed: int = 0,
         num_slots: int | None = None,
         attention: bool = False,
@@ -102,7 +102,8 @@ class WorldModel:
                 (B, H, W, 3), uint8, of `image_size` or a whole multiple of it. Or a rollout, to go on from its last
                 slots; what is drawn with the first frame in mind still is.
             text: what is to be done.
-            horizon: how many frames to imagine after the one that is seen.
+            horizon: how many frames to imagine after the one that is seen; by default `longest_horizon`, or 24 if there
+                is none.
             seed: of the initial slots, where they are drawn at random: a whole number from 0 to 2**64 - 1. The same
                 seed gives a scene the same rollout, alone and among others.
             num_slots: how many slots to look for in an image, background included. The configured number by default;
@@ -125,6 +126,7 @@ class WorldModel:
         if self.model.config.stage == "parser":
             only = "has been through the first stage of training only: it can parse, but what it imagines is noise"
             warnings.warn(f"{self.checkpoint.name} {only}", UserWarning, stacklevel=3)
+        horizon = horizon if horizon is not None else self.longest_horizon or 24
         return self._imagined(self.model.predictor, obs, text, horizon, seed, num_slots, attention)
 
     @property

@@ -24,7 +24,7 @@ CAPTIONS = 8  # that are proposed of a scene
 class Cater:
     """A `World` of scenes as they are drawn. Every caption begins from the scene as it is shown."""
 
-    horizon = FRAMES - 1
+    horizon: int | None = FRAMES - 1
     families: tuple[str, ...] = ()
 
     def __init__(self, image_size: int) -> None:

@@ -24,7 +24,7 @@ from planning import (
     Thing,
 )
 from planning.controller import RESTING_HEIGHTS
-from planning.search import HORIZON
+from planning.planners import HORIZON
 from textocvp import Rollout
 
 Row = Sequence[Any]  # of a layout: kind, colour, x, y, z and yaw
@@ -33,9 +33,9 @@ Row = Sequence[Any]  # of a layout: kind, colour, x, y, z and yaw
 class Tabletop:
     """A `World` whose scene a person arranges, and for which plans can be made."""
 
-    horizon = HORIZON
-
     def __init__(self, env_id: str, image_size: int, **options: Any) -> None:
+        # The robot of the simple scene needs 24 frames, that of others about 50.
+        self.horizon = None if "scene" in options else HORIZON
         options |= {"image_size": image_size, "max_steps": 10**6}
         self.env = gym.make(env_id, control="primitive", record_frames=True, **options)
         self.base = cast(TabletopEnv, self.env.unwrapped)

@@ -19,14 +19,14 @@ class World(Protocol):
     """A simulator with one scene.
 
     Attributes:
-        horizon: frames of a film after the first.
+        horizon: frames of a film after the first; None for as many as the model looks ahead.
         families: kinds of scenes that a link can ask for.
         link: brings the scene back as it is now.
         rgb: the scene as the camera sees it (H, W, 3) uint8.
         task: the sentence that the scene was made for, or "".
     """
 
-    horizon: int
+    horizon: int | None
     link: Link
     rgb: np.ndarray
     task: str

@@ -383,6 +383,7 @@ def test_a_file_of_version_1_is_not_appended_to(whole: Path, tmp_path: Path) -> 
     [
         ({"episodes": 0}, "1 to 10000000"),
         ({"workers": 0}, "at least 1"),
+        ({"without": ("tint",)}, "--without leaves out nothing of --scene simple; --scene varied has"),
         ({"policy": "any-sentence", "sentences_per_scene": 0}, "--sentences-per-scene must be .* at least 1"),
         ({"sentences_per_scene": 3}, "--sentences-per-scene needs --policy any-sentence"),
     ],

@@ -28,6 +28,18 @@ def test_the_score_judges_what_was_imagined_not_what_was_said(objects, camera, g
     assert not any(candidate.reaches_goal for candidate in plan.ranking)
 
 
+def test_what_is_imagined_is_as_long_as_the_model_looks_ahead(oracle: OracleWorldModel, grounder) -> None:
+    goal = Goal.parse("put the red block in the blue bowl")
+    for longest, horizon, frames in ((None, None, 25), (40, None, 41), (40, 30, 31)):
+        oracle.longest_horizon = longest
+        planners = (
+            BeamPlanner(oracle, horizon=horizon),
+            RandomPlanner(oracle, np.random.default_rng(0), horizon=horizon),
+        )
+        for planner in planners:
+            assert planner.plan(RGB, goal, grounder).rollouts[0].slots.shape[1] == frames
+
+
 def test_a_thing_that_is_not_there_is_an_error(oracle: OracleWorldModel, grounder) -> None:
     goal = Goal.parse("put the pink block in the blue bowl")
     for planner in (BeamPlanner(oracle, **ONE_STEP), BeamPlanner(oracle)):

@@ -61,7 +61,7 @@ def test_a_kind_is_changed_first_and_keeps_what_both_kinds_have() -> None:
         ("predictor.layers=two", "predictor.layers is 'two': must be of type int"),
         ("predictor.layers=2.5", "type int"),
         ("predictor.layers=0", "predictor.layers is 0: must be 1 to 16384"),
-        ("predictor.residual=1", "type bool"),
+        ("predictor.residual=1", "true or false"),
         ("predictor.attention=both", "attention is 'both': must be one of window, causal"),
         ("predictor.feed_forwards=true", "must be one of 1, 2"),
         ("parser.kind=random", "parser.kind is 'random': must be one of placed, savi, holistic"),

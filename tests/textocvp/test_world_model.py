@@ -172,6 +172,10 @@ def test_impossible_horizons_are_refused(placed_world_model, scene, horizon, say
         placed_world_model.rollout(scene, TEXT, horizon=horizon)
 
 
+def test_a_film_is_as_long_as_the_model_looks_ahead(placed_world_model: WorldModel, scene: np.ndarray) -> None:
+    assert placed_world_model.rollout(scene, TEXT).slots.shape[1] == placed_world_model.longest_horizon + 1 == 9
+
+
 def test_the_longest_horizon_works(placed_world_model: WorldModel, scene: np.ndarray) -> None:
     assert placed_world_model.longest_horizon == 8
     assert placed_world_model.rollout(scene, TEXT, horizon=np.int64(8)).slots.shape[1] == 9

@@ -343,8 +343,8 @@ def extend(model: TextOCVP, settings: Iterable[str]) -> None:
     for setting in (settings := tuple(settings)):
         if not setting.startswith(("predictor.window=", "predictor.direct=")):
             raise ValueError(
-                f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow and "
-                "predictor.direct change"
+                f"{setting!r}: fine-tuning keeps the checkpoint's architecture; only predictor.window may grow "
+                "(predictor.window=40) and predictor.direct change (predictor.direct=true)"
             )
     config, predictor = with_settings(model.config, settings), model.predictor
     old, new = model.config.predictor, config.predictor
