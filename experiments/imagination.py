@@ -71,7 +71,7 @@ from planning import (
     places,
     run_episode,
 )
-from planning.search import HORIZON
+from planning.planners import HORIZON, frames_ahead
 from textocvp.checkpoint import WEIGHTS_FILE
 from textocvp.protocols import LoadCheckpoint
 
@@ -202,7 +202,7 @@ class ConsequenceClip:
         env = worker.environment(episode.scene)
         observation, info = env.reset(seed=episode.scene.seed, options=dict(episode.scene.options))
         goal, model = goal_of(observation, info), worker.world_model
-        horizon = model.longest_horizon or HORIZON
+        horizon = frames_ahead(model)
         if episode.scene.look == "simple":  # in others the arm takes longer
             horizon = min(HORIZON, horizon)
         if said_at_once := isinstance(goal, Goal):

@@ -107,11 +107,9 @@ class _Branch:
     imagined: tuple[tuple[Rollout, int], ...] = ()  # of each instruction: the batch, and the row in it
 
 
-def frames_ahead(planner: BeamPlanner | RandomPlanner) -> int:
-    """The planner's horizon, or else its model's, or else `HORIZON`."""
-    if planner.horizon is not None:
-        return planner.horizon
-    return getattr(planner.world_model, "longest_horizon", None) or HORIZON
+def frames_ahead(model: Imagines, horizon: int | None = None) -> int:
+    """The horizon that was asked for, or else the model's, or else `HORIZON`."""
+    return horizon if horizon is not None else getattr(model, "longest_horizon", None) or HORIZON
 
 
 @dataclass
@@ -152,7 +150,9 @@ class BeamPlanner(_LooksAtMasks):
             ]
             rows, texts = [row for row, _ in steps], [one.text for _, one in steps]
             starts = starts.select(rows)
-            rollout = self.world_model.rollout(starts, texts, horizon=frames_ahead(self), seed=self.seed)
+            rollout = self.world_model.rollout(
+                starts, texts, horizon=frames_ahead(self.world_model, self.horizon), seed=self.seed
+            )
             length = rollout.slots.shape[1]
             frames = watched_frames(length, THRESHOLDS.settle_frames, self.stride)
             new = [measure_rollout(rollout, grounding, want, frames=frames) for want in wanted]
@@ -205,7 +205,11 @@ class RandomPlanner(_LooksAtMasks):
         sequences = self._draw(parsed, grounding, goal)
         rollouts, start = [], parsed
         for one in sequences[0]:
-            rollouts.append(self.world_model.rollout(start, [one.text], horizon=frames_ahead(self), seed=self.seed))
+            rollouts.append(
+                self.world_model.rollout(
+                    start, [one.text], horizon=frames_ahead(self.world_model, self.horizon), seed=self.seed
+                )
+            )
             start = rollouts[-1].last
         ranking = tuple(Candidate(sequence, 0.0, False) for sequence in sequences)
         return Plan(ranking, tuple(rollouts), grounding, perf_counter() - began)

@@ -20,7 +20,7 @@ from torch import Tensor
 from .camera import View
 from .grounding import Grounder, Grounding, GroundingError
 from .language import AnyGoal, Goal, Instruction, PictureGoal, Thing
-from .planners import HORIZON, Candidate, Imagines, Plan, observe
+from .planners import Candidate, Imagines, Plan, frames_ahead, observe
 from .relations import CLOSE_VIEW, RELATIONS
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ class SearchPlanner:
         for step in range(len(goals[0].instructions)):
             texts = [one.instructions[step].text for one in goals]
             before = films[-1].last if films else parsed.select([0] * len(goals))
-            horizon = self.world_model.longest_horizon or HORIZON
+            horizon = frames_ahead(self.world_model)
             films.append(self.world_model.rollout(before, texts, horizon=horizon, seed=self.seed))
         ends_BG = wanted.ratios(places(films[-1], grounding, sorted(grounding.things)))
         for row in torch.nonzero((ends_BG <= 1).all(1)).flatten().tolist():

@@ -21,7 +21,7 @@ from experiments.play.tabletop import Tabletop, slot_names
 from experiments.play.worlds import Choice
 from experiments.study.foresight import foresight
 from planning import Goal, PictureGoal, SearchPlanner
-from planning.planners import HORIZON
+from planning.planners import frames_ahead
 from textocvp import Rollout, WorldModel
 from textocvp.film_page import film_data, picture_url, save_page
 from textocvp.pictures import SUFFIXES, read_picture, save_film
@@ -72,9 +72,8 @@ class Session:
         self.world_model, self.choice = world_model, choice
         self.lock = threading.Lock()
         self.world = choice.make(world_model.image_size[0])
-        longest = world_model.longest_horizon
-        horizon = horizon or self.world.horizon or longest or HORIZON
-        self.horizon = min(horizon, longest or horizon)
+        horizon = horizon or self.world.horizon or frames_ahead(world_model)
+        self.horizon = min(horizon, world_model.longest_horizon or horizon)
         self.picture: np.ndarray | None = None  # a person's own, instead of the scene
         self.goal: Goal | PictureGoal | None = None
         self.before_goal: Link | None = None  # the scene, while the goal is arranged

@@ -32,7 +32,7 @@ from planning import (
     seen_supports,
 )
 from planning.masks import centroids
-from planning.search import HORIZON
+from planning.planners import frames_ahead
 from textocvp.protocols import LoadModel
 from textocvp.rollout import Rollout
 
@@ -52,7 +52,7 @@ class ByFilms:
 
     def outcome(self, obs: Rollout, text: Sequence[str], *, seed: int = 0) -> Rollout:
         """See `Foresees`."""
-        film = self.rollout(obs, text, horizon=self.longest_horizon or HORIZON, seed=seed)
+        film = self.rollout(obs, text, horizon=frames_ahead(self), seed=seed)
         return replace(film, slots=film.slots[:, [0, -1]])
 
 

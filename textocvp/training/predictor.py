@@ -179,9 +179,8 @@ def train(args: PredictorTraining) -> InstructionFollowing | SlotErrors | Outcom
         # One frame more than the past, so that every time code gets trained.
         longest = int(slots.lengths.max())
         frames = predictor.config.window + 1 if causal else longest
-        if args.outcome:  # first and last frame of every episode, however long it is
-            frames, longest = 2, max(longest, int(val_slots.lengths.max()))
-        every = longest - 1 if args.outcome else 1
+        ends = 2, max(longest, int(val_slots.lengths.max())) - 1  # first and last frame, however long the episode is
+        frames, every = ends if args.outcome else (frames, 1)
         if longest > every * (frames - 1) + 1 and accelerator.is_main_process:
             warnings.warn(
                 f"{(slots.lengths > frames).mean():.0%} of the episodes of {args.data} are longer than the "
